@@ -1,0 +1,33 @@
+"""What a node writes down of itself, one row per period, for the bench to merge by time."""
+
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class Record:
+    """Rows of numbers under fixed column names; the first column is `time_ns` on the node's own clock.
+
+    Parameters
+    ----------
+    columns : tuple of str
+        Column names with their units.
+    typecode : str
+        `array.array` type: ``"d"`` or, for integers only, ``"q"``.
+    """
+
+    def __init__(self, columns: tuple[str, ...], typecode: str) -> None:
+        self.columns = columns
+        self._cells = array(typecode)
+        self.append = self._cells.extend
+
+    def columns_by_name(self) -> dict[str, np.ndarray]:
+        """Return each column as an array of the number of rows."""
+        table = np.array(self._cells).reshape(-1, len(self.columns))
+        return dict(zip(self.columns, table.T, strict=True))
+
+    def save(self, path: Path, **extra: Any) -> None:
+        """Write the columns, and `extra` scalars, to an `.npz` file."""
+        np.savez(path, **self.columns_by_name(), **extra)

@@ -1,0 +1,25 @@
+"""``python -m firmware_py``: the firmware emulator as a process of its own on a bus."""
+
+import argparse
+import sys
+
+from dbc.contract import Contract
+from firmware_py.node import PHASE_NS, Controller
+from firmware_py.tuning import Tuning
+from hil.bus.wire import Clock
+from hil.run.node_process import add_node_arguments, node_main
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the controller until it is stopped."""
+    parser = argparse.ArgumentParser(prog="python -m firmware_py", description=__doc__)
+    add_node_arguments(parser)
+
+    def build(arguments: argparse.Namespace) -> Controller:
+        return Controller(Contract.load(arguments.dbc), Tuning().calibration().to_bytes())
+
+    return node_main(parser, build, Clock(PHASE_NS), argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

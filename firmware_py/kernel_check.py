@@ -1,0 +1,385 @@
+"""Check that the kernel stays in its restricted Python: ``python -m firmware_py.kernel_check``.
+
+Widths are C's and are known without running anything: array elements and literals have 32 bits, annotations
+give those of parameters and results, a variable keeps the width of its first assignment. The subset is small
+enough to transpile: assignments, if, while, for over a constant range, calls, returns of one scalar.
+"""
+
+import ast
+import importlib.util
+import pkgutil
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from firmware_py import kernel
+
+KERNEL = kernel.__name__
+MACHINE = "machine"
+"""The module that declares the machine words; the only one whose bodies are not in the subset."""
+
+Kind = int | str | None
+"""Width 32 or 64, "literal" (any width), "array", "bool", None for no value."""
+
+WIDTHS: dict[str, Kind] = {"int32": 32, "int64": 64, "Array32": "array", "None": None}
+ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.LShift, ast.RShift)
+ALLOCATIONS = (
+    ast.List,
+    ast.Dict,
+    ast.Set,
+    ast.Tuple,
+    ast.ListComp,
+    ast.DictComp,
+    ast.SetComp,
+    ast.GeneratorExp,
+    ast.JoinedStr,
+    ast.Lambda,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """Kinds of a kernel function's parameters and of its result."""
+
+    parameters: tuple[Kind, ...]
+    result: Kind
+
+
+@dataclass(slots=True)
+class Module:
+    """What a kernel module defines."""
+
+    path: str
+    tree: ast.Module
+    constants: dict[str, int] = field(default_factory=dict)
+    functions: dict[str, Signature] = field(default_factory=dict)
+
+
+class Violation(Exception):  # noqa: N818
+    """A node outside the subset; ends the walk through its statement."""
+
+    def __init__(self, node: ast.AST, message: str) -> None:
+        super().__init__(f"{getattr(node, 'lineno', 0)}: {message}")
+
+
+def kernel_sources() -> dict[str, tuple[str, str]]:
+    """Return path and source of each kernel module by its short name."""
+    sources = {}
+    for info in pkgutil.iter_modules(kernel.__path__, KERNEL + "."):
+        spec = importlib.util.find_spec(info.name)
+        assert spec is not None
+        assert spec.origin is not None
+        sources[info.name.rpartition(".")[2]] = (spec.origin, Path(spec.origin).read_text(encoding="utf-8"))
+    return sources
+
+
+def check(sources: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Check kernel modules against each other.
+
+    Parameters
+    ----------
+    sources : mapping of str to (str, str)
+        Path and source of each module by its short name.
+
+    Returns
+    -------
+    list of str
+        One line for each violation: ``path:line: message``.
+    """
+    modules = {name: _declared(path, ast.parse(source)) for name, (path, source) in sources.items()}
+    violations = []
+    for name, module in modules.items():
+        for line in _ModuleChecker(module, modules).violations(bodies=name != MACHINE):
+            violations.append(f"{module.path}:{line}")
+    return violations
+
+
+def _declared(path: str, tree: ast.Module) -> Module:
+    module = Module(path, tree)
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            value = _constant(node.value)
+            if value is not None:
+                module.constants[node.targets[0].id] = value
+        if isinstance(node, ast.FunctionDef):
+            kinds = [_annotated(argument.annotation) for argument in node.args.args]
+            module.functions[node.name] = Signature(tuple(kinds), _annotated(node.returns))
+    return module
+
+
+def _constant(node: ast.expr) -> int | None:
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        value = _constant(node.operand)
+        return None if value is None else -value
+    if isinstance(node, ast.Constant) and type(node.value) is int:
+        return node.value
+    return None
+
+
+def _annotated(annotation: ast.expr | None) -> Kind:
+    text = "" if annotation is None else ast.unparse(annotation)
+    return WIDTHS.get(text, "unknown")
+
+
+def _of_constant(value: int) -> Kind:
+    return "literal" if -(2**31) <= value < 2**31 else 64
+
+
+@dataclass(slots=True)
+class _ModuleChecker:
+    module: Module
+    modules: Mapping[str, Module]
+    constants: dict[str, int] = field(default_factory=dict)
+    functions: dict[str, Signature] = field(default_factory=dict)
+
+    def violations(self, *, bodies: bool) -> Iterator[str]:
+        for position, node in enumerate(self.module.tree.body):
+            try:
+                if isinstance(node, ast.ImportFrom):
+                    self._import(node)
+                elif isinstance(node, ast.FunctionDef):
+                    self.functions[node.name] = self.module.functions[node.name]
+                elif isinstance(node, ast.Assign) and not bodies:
+                    continue
+                elif not (position == 0 and _is_docstring(node)):
+                    self._constant(node)
+            except Violation as violation:
+                yield str(violation)
+        self.functions |= self.module.functions
+        if bodies:
+            for node in self.module.tree.body:
+                if isinstance(node, ast.FunctionDef):
+                    yield from _FunctionChecker(self.constants, self.functions).violations(node)
+
+    def _import(self, node: ast.ImportFrom) -> None:
+        package, _, name = (node.module or "").rpartition(".")
+        source = self.modules.get(name)
+        if package != KERNEL or source is None:
+            raise Violation(node, f"import from outside the kernel: {node.module}")
+        for alias in node.names:
+            if alias.name in source.functions:
+                self.functions[alias.name] = source.functions[alias.name]
+            elif alias.name in source.constants:
+                self.constants[alias.name] = source.constants[alias.name]
+            elif alias.name not in WIDTHS:
+                raise Violation(node, f"import of {alias.name}, which is no function or integer constant")
+
+    def _constant(self, node: ast.stmt) -> None:
+        if isinstance(node, ast.Import):
+            raise Violation(node, f"import from outside the kernel: {node.names[0].name}")
+        if not isinstance(node, ast.Assign) or _constant(node.value) is None:
+            raise Violation(node, "a module holds only imports, integer constants and functions")
+        for target in node.targets:
+            if isinstance(target, ast.Name):
+                self.constants[target.id] = self.module.constants[target.id]
+
+
+def _is_docstring(node: ast.stmt) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+class _FunctionChecker:
+    """Walks one function; `variables` holds the kinds of its names, `positive` the divisors known > 0."""
+
+    def __init__(self, constants: Mapping[str, int], functions: Mapping[str, Signature]) -> None:
+        self.constants = constants
+        self.functions = functions
+        self.variables: dict[str, Kind] = {}
+        self.positive: set[str] = set()
+        self.result: Kind = None
+
+    def violations(self, function: ast.FunctionDef) -> Iterator[str]:
+        signature = self.functions[function.name]
+        self.result = signature.result
+        arguments = function.args
+        if "unknown" in (*signature.parameters, signature.result) or signature.result == "array":
+            yield f"{function.lineno}: {function.name}: annotate with int32, int64, Array32, None"
+            return
+        if function.decorator_list or arguments.defaults or arguments.vararg or arguments.kwonlyargs:
+            yield f"{function.lineno}: {function.name}: only plain positional parameters, no decorators"
+        for argument, kind in zip(arguments.args, signature.parameters, strict=True):
+            self.variables[argument.arg] = kind
+        body = function.body[1:] if _is_docstring(function.body[0]) else function.body
+        yield from self._block(body)
+
+    def _block(self, body: Iterable[ast.stmt]) -> Iterator[str]:
+        for statement in body:
+            try:
+                yield from self._statement(statement)
+            except Violation as violation:
+                yield str(violation)
+
+    def _statement(self, node: ast.stmt) -> Iterator[str]:
+        match node:
+            case ast.Assign(targets=[ast.Name() as target]):
+                self._assign(target, self._number(node.value))
+            case ast.Assign(targets=[ast.Subscript() as target]):
+                self._kind(target)
+                self._narrowed(node.value, "unnarrowed store")
+            case ast.Return(value=None):
+                if self.result is not None:
+                    raise Violation(node, "a return without its value")
+            case ast.Return(value=value):
+                assert value is not None
+                self._return(value)
+            case ast.Expr(value=ast.Call() as call):
+                self._kind(call)
+            case ast.If() | ast.While():
+                yield from self._branch(node)
+            case ast.For():
+                yield from self._loop(node)
+            case _:
+                raise Violation(node, f"not in the subset: {type(node).__name__}")
+
+    def _assign(self, target: ast.Name, kind: Kind) -> None:
+        known = self.variables.setdefault(target.id, 32 if kind == "literal" else kind)
+        if kind not in (known, "literal"):
+            raise Violation(target, f"width of {target.id} changes from {known} to {kind}")
+        self.positive.discard(target.id)
+
+    def _return(self, value: ast.expr) -> None:
+        if self.result == 32:
+            self._narrowed(value, "unnarrowed result")
+        elif self._number(value) not in (self.result, "literal"):
+            raise Violation(value, f"result is not int{self.result}")
+
+    def _branch(self, node: ast.If | ast.While) -> Iterator[str]:
+        if self._kind(node.test) != "bool":
+            raise Violation(node, "a condition is a comparison")
+        outside = set(self.positive)
+        self.positive |= _tested_positive(node.test)
+        yield from self._block(node.body)
+        assigned = {child.id for child in ast.walk(node) if _is_target(child) and isinstance(child, ast.Name)}
+        self.positive = outside - assigned
+        if isinstance(node, ast.While) and node.orelse:
+            raise Violation(node, "not in the subset: else of a loop")
+        yield from self._block(node.orelse)
+        self.positive -= assigned
+
+    def _loop(self, node: ast.For) -> Iterator[str]:
+        match node:
+            case ast.For(
+                target=ast.Name(id=name), iter=ast.Call(func=ast.Name(id="range"), args=bounds), orelse=[]
+            ):
+                if any(self._kind(bound) != "literal" for bound in bounds):
+                    raise Violation(node, "the bounds of a for are constants")
+                self.variables[name] = 32
+                self.positive = set()
+                yield from self._block(node.body)
+            case _:
+                raise Violation(node, "not in the subset: a for that does not run over a constant range")
+
+    def _narrowed(self, value: ast.expr, message: str) -> None:
+        """Allow what is already 32 bits wide; a 32-bit sum or negation has to say `i32` or `sat32`."""
+        kind = self._number(value)
+        is_arithmetic = isinstance(value, ast.BinOp | ast.UnaryOp) and _constant(value) is None
+        if kind not in (32, "literal") or is_arithmetic:
+            raise Violation(value, f"{message}: {ast.unparse(value)}")
+
+    def _number(self, node: ast.expr) -> Kind:
+        kind = self._kind(node)
+        if kind not in (32, 64, "literal"):
+            raise Violation(node, f"not an integer: {ast.unparse(node)}")
+        return kind
+
+    def _kind(self, node: ast.expr) -> Kind:
+        match node:
+            case ast.Constant(value=float()):
+                raise Violation(node, f"float literal {ast.unparse(node)}")
+            case ast.Constant() if type(node.value) is int:
+                return _of_constant(node.value)
+            case ast.Name(id=name) if name in self.variables:
+                return self.variables[name]
+            case ast.Name(id=name) if name in self.constants:
+                return _of_constant(self.constants[name])
+            case ast.Name(id=name):
+                raise Violation(node, f"{name} is unknown here")
+            case ast.Subscript(value=ast.Name(id=name)) if self.variables.get(name) == "array":
+                if self._number(node.slice) == 64:
+                    raise Violation(node, "a 64-bit index")
+                return 32
+            case ast.BinOp():
+                return self._operation(node)
+            case ast.UnaryOp(op=ast.USub()):
+                return self._number(node.operand)
+            case ast.UnaryOp(op=ast.Not()) | ast.BoolOp():
+                parts = node.values if isinstance(node, ast.BoolOp) else [node.operand]
+                if any(self._kind(part) != "bool" for part in parts):
+                    raise Violation(node, "a condition is a comparison")
+                return "bool"
+            case ast.Compare(ops=[_]):
+                self._number(node.left)
+                self._number(node.comparators[0])
+                return "bool"
+            case ast.Call(func=ast.Name()):
+                return self._call(node)
+            case _ if isinstance(node, ALLOCATIONS):
+                raise Violation(node, f"allocation: {type(node).__name__}")
+            case _:
+                raise Violation(node, f"not in the subset: {type(node).__name__}")
+
+    def _operation(self, node: ast.BinOp) -> Kind:
+        if isinstance(node.op, ast.Div | ast.FloorDiv | ast.Mod):
+            raise Violation(node, f"division by an operator, use div: {ast.unparse(node)}")
+        if not isinstance(node.op, ARITHMETIC):
+            raise Violation(node, f"not in the subset: {type(node.op).__name__}")
+        left, right = self._number(node.left), self._number(node.right)
+        if isinstance(node.op, ast.Mult) and (left, right) != (64, 64):
+            raise Violation(node, f"product without 64-bit operands: {ast.unparse(node)}")
+        if isinstance(node.op, ast.LShift | ast.RShift):
+            return 32 if left == "literal" else left
+        return 64 if 64 in (left, right) else 32
+
+    def _call(self, node: ast.Call) -> Kind:
+        assert isinstance(node.func, ast.Name)
+        name = node.func.id
+        signature = self.functions.get(name)
+        if signature is None:
+            raise Violation(node, f"call of {name}, which is no kernel function")
+        if node.keywords or len(node.args) != len(signature.parameters):
+            raise Violation(node, f"{name} takes {len(signature.parameters)} positional arguments")
+        for argument, expected in zip(node.args, signature.parameters, strict=True):
+            kind = self._kind(argument)
+            fits = kind == expected or (kind == "literal" and expected in (32, 64))
+            if not fits and not (name in ("i32", "i64") and kind in (32, 64)):
+                raise Violation(argument, f"{name} takes {expected}, not {kind}: {ast.unparse(argument)}")
+        if name == "div":
+            self._guarded(node.args[1])
+        return signature.result
+
+    def _guarded(self, divisor: ast.expr) -> None:
+        constant = _constant(divisor)
+        is_tested = isinstance(divisor, ast.Name) and divisor.id in self.positive
+        if not is_tested and not (constant is not None and constant > 0):
+            raise Violation(divisor, f"unguarded divisor, test it > 0 around div: {ast.unparse(divisor)}")
+
+
+def _tested_positive(test: ast.expr) -> set[str]:
+    """Names that `test` shows to be > 0."""
+    match test:
+        case ast.Compare(left=ast.Name(id=name), ops=[ast.Gt()], comparators=[ast.Constant(value=0)]):
+            return {name}
+        case ast.BoolOp(op=ast.And(), values=values):
+            return {name for value in values for name in _tested_positive(value)}
+    return set()
+
+
+def _is_target(node: ast.AST) -> bool:
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+
+
+def main() -> int:
+    """Check the kernel; print one line per violation."""
+    violations = check(kernel_sources())
+    for violation in violations:
+        print(violation)
+    return 1 if violations else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,196 @@
+"""Host side: physical gains (SI floats) to a calibration block. Never imported by the node or the kernel."""
+
+import math
+from dataclasses import dataclass, field
+
+from firmware_py.calibration import INT32_MAX, MAX_SHIFT, MIN_SHIFT, VALUE_RANGES, WORD_NAMES, Calibration
+from firmware_py.kernel import layout as k
+
+PERIOD_S = 1e-3
+
+POSITION_LSB = 2.0**-31  # m: v1, z1 and every position error
+SPEED_LSB = 2.0**-38  # m: v2 T, z2 T
+ACCELERATION_LSB = 2.0**-40  # m: v3 T^2, z3 T^2
+DISTURBANCE_LSB = 2.0**-42  # m: z4 T^3
+WORK_LSB = 2.0**-34  # m: inside fhan
+U_LSB = 2.0**-20  # rad/s
+SETPOINT_LSB_M = 1e-7
+VELOCITY_LSB_RAD_S = math.pi / 120  # 0.25 rpm
+
+RELATIVE_PRECISION = 1e-6
+"""A gain whose mantissa cannot come this close to it is refused."""
+
+
+class TuningError(ValueError):
+    """A physical gain that the kernel's number formats cannot represent."""
+
+
+@dataclass(frozen=True, slots=True)
+class PiTuning:
+    """Proportional and integral gain; `ki_rad_s2_per_m` = 0 makes a P controller."""
+
+    kp_rad_s_per_m: float
+    ki_rad_s2_per_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class AdrcTuning:
+    """ADRC with bandwidth gains; the defaults are the ones the paper's design was completed with.
+
+    The exponents of fal are part of the kernel (1/4 and 1/8 in the observer, 3/4 in the feedback): its
+    integer square roots make them. A very wide linear zone makes a linear controller.
+    """
+
+    r0_m_s2: float = 25.0
+    h0_s: float = 5e-3
+    omega_o_rad_s: float = 200.0
+    b0_m_s2_per_rad: float = 70.0
+    a1n_per_s2: float = -5e4
+    a2n_per_s: float = 0.0
+    omega_c_rad_s: float = 180.0
+    eso_delta_m: float = 1e-4
+    delta1_m: float = 1e-3
+    delta2_m_s: float = 0.04
+    delta3_m_s2: float = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class LimiterTuning:
+    """Velocity and acceleration a setpoint may ask for."""
+
+    speed_m_s: float = 0.14
+    acceleration_m_s2: float = 1.0
+
+
+P = PiTuning(31_100.0)
+PI = PiTuning(27_270.0, 39_900.0)
+PI_STAR = PiTuning(20_853.0, 513_300.0)
+ADRC = AdrcTuning()
+
+
+def _gain(index: int, factor: float) -> dict[int, int]:
+    """Mantissa and shift of `factor`: the largest shift whose mantissa fits 31 bits."""
+    name = WORD_NAMES[index]
+    if factor == 0:
+        return {index: 0, index + 1: MIN_SHIFT}
+    if not math.isfinite(factor):
+        raise TuningError(f"tuning: {name} = {factor} is not finite")
+    shift = min(MAX_SHIFT, 31 - math.frexp(factor)[1])
+    if abs(round(math.ldexp(factor, shift))) > INT32_MAX:
+        shift -= 1
+    mantissa = round(math.ldexp(factor, shift))
+    if shift < MIN_SHIFT:
+        raise TuningError(f"tuning: {name} = {factor:.6g} exceeds {INT32_MAX * 2.0**-MIN_SHIFT:.6g}")
+    if abs(math.ldexp(mantissa, -shift) - factor) > RELATIVE_PRECISION * abs(factor):
+        raise TuningError(f"tuning: {name} = {factor:.6g} is too small for 31 bits at shift {MAX_SHIFT}")
+    return {index: mantissa, index + 1: shift}
+
+
+def _value(index: int, physical: float, lsb: float) -> dict[int, int]:
+    name = WORD_NAMES[index]
+    low, high = VALUE_RANGES[index]
+    if not low * lsb <= physical <= high * lsb:
+        raise TuningError(f"tuning: {name} = {physical:.6g} outside {low * lsb:.6g}..{high * lsb:.6g}")
+    return {index: round(physical / lsb)}
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """Everything a calibration block holds.
+
+    Parameters
+    ----------
+    law : int
+        Default control law.
+    speed_limit_rpm : float
+        The drive's speed; rounded down to 0.25 rpm.
+    """
+
+    law: int = k.LAW_ADRC
+    p: PiTuning = P
+    pi: PiTuning = PI
+    adrc: AdrcTuning = field(default_factory=AdrcTuning)
+    limiter: LimiterTuning = field(default_factory=LimiterTuning)
+    speed_limit_rpm: float = 3000.0
+
+    def calibration(self) -> Calibration:
+        """Return the calibration block.
+
+        Raises
+        ------
+        TuningError
+            When a gain cannot be represented; the message is one line.
+        """
+        if self.p.ki_rad_s2_per_m != 0:
+            raise TuningError("tuning: the P law has no integral gain")
+        words = self._limits() | self._pi() | _differentiator(self.adrc) | _observer(self.adrc)
+        words |= _feedback(self.adrc)
+        return Calibration(self.law, tuple(words[index] for index in range(k.CAL_SIZE)))
+
+    def _limits(self) -> dict[int, int]:
+        limit_rad_s = math.floor(self.speed_limit_rpm * 4) * VELOCITY_LSB_RAD_S
+        rate_m = self.limiter.speed_m_s * PERIOD_S
+        slew_m = self.limiter.acceleration_m_s2 * PERIOD_S**2
+        # rounding the setpoint to its LSB adds up to 1 LSB to its increments and 2 to their differences,
+        # rounding it to the kernel's LSB as much again
+        rounding_m = SETPOINT_LSB_M + 1.5 * POSITION_LSB
+        return (
+            _value(k.CAL_U_LIMIT, limit_rad_s, U_LSB)
+            | _value(k.CAL_LIMITER_RATE, rate_m + rounding_m, POSITION_LSB)
+            | _value(k.CAL_LIMITER_SLEW, slew_m + 2 * rounding_m, POSITION_LSB)
+            | _value(k.CAL_LIMITER_BRAKE, slew_m, POSITION_LSB)
+        )
+
+    def _pi(self) -> dict[int, int]:
+        lsb = POSITION_LSB / U_LSB
+        return (
+            _gain(k.CAL_P_KP, self.p.kp_rad_s_per_m * lsb)
+            | _gain(k.CAL_PI_KP, self.pi.kp_rad_s_per_m * lsb)
+            | _gain(k.CAL_PI_KI, self.pi.ki_rad_s2_per_m * PERIOD_S * lsb)
+        )
+
+
+def _differentiator(adrc: AdrcTuning) -> dict[int, int]:
+    periods = adrc.h0_s / PERIOD_S
+    return (
+        _value(k.CAL_TD_R, adrc.r0_m_s2 * PERIOD_S**2, ACCELERATION_LSB)
+        | _value(k.CAL_TD_D, adrc.r0_m_s2 * adrc.h0_s**2, WORK_LSB)
+        | _gain(k.CAL_TD_H, periods * SPEED_LSB / WORK_LSB)
+        | _gain(k.CAL_LEAD_V1, 2 * periods * SPEED_LSB / POSITION_LSB)
+        | _gain(k.CAL_LEAD_V2, 2 * periods * ACCELERATION_LSB / SPEED_LSB)
+    )
+
+
+def _observer(adrc: AdrcTuning) -> dict[int, int]:
+    w = adrc.omega_o_rad_s * PERIOD_S
+    return (
+        _value(k.CAL_ESO_DELTA, adrc.eso_delta_m, POSITION_LSB)
+        | _gain(k.CAL_ESO_BETA1, 4 * w)
+        | _gain(k.CAL_ESO_BETA2, 6 * w**2 * POSITION_LSB / SPEED_LSB)
+        | _gain(k.CAL_ESO_BETA3, 4 * w**3 * POSITION_LSB / ACCELERATION_LSB)
+        | _gain(k.CAL_ESO_BETA4, w**4 * POSITION_LSB / DISTURBANCE_LSB)
+        | _gain(k.CAL_ESO_A1, adrc.a1n_per_s2 * PERIOD_S**2 * SPEED_LSB / ACCELERATION_LSB)
+        | _gain(k.CAL_ESO_A2, adrc.a2n_per_s * PERIOD_S)
+        | _gain(k.CAL_ESO_B0, adrc.b0_m_s2_per_rad * PERIOD_S**3 * U_LSB / ACCELERATION_LSB)
+    )
+
+
+def _feedback(adrc: AdrcTuning) -> dict[int, int]:
+    if not adrc.b0_m_s2_per_rad > 0:
+        raise TuningError(f"tuning: b0 = {adrc.b0_m_s2_per_rad} must be positive")
+    per_b0 = 1 / (adrc.b0_m_s2_per_rad * U_LSB)
+    w = adrc.omega_c_rad_s
+    position = per_b0 * POSITION_LSB
+    speed = per_b0 * SPEED_LSB / PERIOD_S
+    acceleration = per_b0 * ACCELERATION_LSB / PERIOD_S**2
+    return (
+        _value(k.CAL_FB_DELTA1, adrc.delta1_m, POSITION_LSB)
+        | _value(k.CAL_FB_DELTA2, adrc.delta2_m_s * PERIOD_S, SPEED_LSB)
+        | _value(k.CAL_FB_DELTA3, adrc.delta3_m_s2 * PERIOD_S**2, ACCELERATION_LSB)
+        | _gain(k.CAL_FB_K1, w**3 * position)
+        | _gain(k.CAL_FB_K2, 3 * w**2 * speed)
+        | _gain(k.CAL_FB_K3, 3 * w * acceleration)
+        | _gain(k.CAL_FB_A1, adrc.a1n_per_s2 * speed)
+        | _gain(k.CAL_FB_A2, adrc.a2n_per_s * acceleration)
+        | _gain(k.CAL_FB_Z4, per_b0 * DISTURBANCE_LSB / PERIOD_S**3)
+    )

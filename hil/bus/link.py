@@ -1,0 +1,188 @@
+"""Packets between a hub and its participants, over AF_UNIX SEQPACKET sockets in a private directory.
+
+Frames keep SocketCAN's 16-byte layout. A participant says hello in JSON and is answered in JSON; after that
+
+- a *bus* participant (any python-can program) sends frames and receives frames with their bus time;
+- a *node* in virtual time receives one event at a time and answers each with its actions.
+"""
+
+import json
+import os
+import socket
+import stat
+import struct
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from dbc.frame import Frame
+from dbc.node import Actions
+
+PROTOCOL_VERSION = 1
+MAX_PACKET = 65536
+START, TIMER, FRAME, STOP = range(4)
+_NO_WAKE = -(1 << 63)
+
+_FRAME = struct.Struct("<IB3xQ")
+_TIMED_FRAME = struct.Struct("<qIB3xQ")
+_EVENT = struct.Struct("<Bq")
+_WAKE = struct.Struct("<q")
+
+
+class LinkError(Exception):
+    """A hub cannot be reached, refused us, or went away; the message says what to do."""
+
+
+def pack_frame(frame: Frame) -> bytes:
+    """Return a frame as SocketCAN's `struct can_frame`."""
+    return _FRAME.pack(*frame)
+
+
+def unpack_frame(packet: bytes) -> Frame:
+    """Return the frame in a `struct can_frame`."""
+    return Frame(*_FRAME.unpack(packet))
+
+
+def pack_timed(time_ns: int, frame: Frame) -> bytes:
+    """Return a frame behind its bus time in ns."""
+    return _TIMED_FRAME.pack(time_ns, *frame)
+
+
+def unpack_timed(packet: bytes) -> tuple[int, Frame]:
+    """Return bus time in ns and frame."""
+    time_ns, can_id, dlc, data = _TIMED_FRAME.unpack(packet)
+    return time_ns, Frame(can_id, dlc, data)
+
+
+def pack_event(kind: int, now_ns: int, frames: Iterable[bytes] = ()) -> bytes:
+    """Return an event with the (packed, timed) frames that are delivered before it."""
+    return _EVENT.pack(kind, now_ns) + b"".join(frames)
+
+
+def unpack_event(packet: bytes) -> tuple[int, int, list[tuple[int, Frame]]]:
+    """Return kind, node time in ns and the timed frames of an event."""
+    kind, now_ns = _EVENT.unpack_from(packet)
+    return kind, now_ns, _timed_frames(packet[_EVENT.size :])
+
+
+def pack_actions(actions: Actions) -> bytes:
+    """Return a node's answer to an event."""
+    wake_ns, sends = actions
+    head = _WAKE.pack(_NO_WAKE if wake_ns is None else wake_ns)
+    return head + b"".join([_TIMED_FRAME.pack(send_ns, *frame) for send_ns, frame in sends])
+
+
+def unpack_actions(packet: bytes) -> Actions:
+    """Return the actions in a node's answer."""
+    (wake_ns,) = _WAKE.unpack_from(packet)
+    return Actions(None if wake_ns == _NO_WAKE else wake_ns, tuple(_timed_frames(packet[_WAKE.size :])))
+
+
+def _timed_frames(packed: bytes) -> list[tuple[int, Frame]]:
+    return [
+        (time_ns, Frame(can_id, dlc, data)) for time_ns, can_id, dlc, data in _TIMED_FRAME.iter_unpack(packed)
+    ]
+
+
+def socket_directory() -> Path:
+    """Return the directory of this user's hub sockets, made with mode 0700.
+
+    Raises
+    ------
+    LinkError
+        If it belongs to somebody else or is open to others.
+    """
+    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
+    directory = Path(base) / f"hilbus-{os.getuid()}"
+    directory.mkdir(mode=0o700, exist_ok=True)
+    status = directory.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise LinkError(f"{directory} is not a private directory of yours: remove it or set XDG_RUNTIME_DIR")
+    return directory
+
+
+def socket_path(channel: str) -> Path:
+    """Return the socket of a channel.
+
+    Raises
+    ------
+    LinkError
+        If the name cannot be a file name.
+    """
+    if not channel or not all(c.isalnum() or c in "-_." for c in channel) or channel.startswith("."):
+        raise LinkError(f"channel name {channel!r}: use letters, digits, '-', '_' and '.'")
+    path = socket_directory() / f"{channel}.sock"
+    if len(os.fsencode(path)) > 100:
+        raise LinkError(f"{path} is too long for a socket: choose a shorter channel name or XDG_RUNTIME_DIR")
+    return path
+
+
+def seqpacket_socket() -> socket.socket:
+    """Return a new AF_UNIX SEQPACKET socket.
+
+    Raises
+    ------
+    LinkError
+        On a system that has none (macOS, Windows).
+    """
+    try:
+        return socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    except (AttributeError, OSError) as error:
+        raise LinkError(
+            f"the embedded bus needs AF_UNIX SEQPACKET sockets ({error}): use Linux, or --mode inprocess"
+        ) from error
+
+
+def send_json(link: socket.socket, content: dict[str, Any]) -> None:
+    """Send one hello or its answer."""
+    link.send(json.dumps(content).encode())
+
+
+def receive_json(link: socket.socket) -> dict[str, Any]:
+    """Receive one hello or its answer.
+
+    Raises
+    ------
+    LinkError
+        If the other side went away or speaks something else.
+    """
+    try:
+        packet = link.recv(MAX_PACKET)
+        content = json.loads(packet) if packet else None
+    except (OSError, ValueError) as error:
+        raise LinkError(f"no answer in the hub's protocol ({error})") from error
+    if not isinstance(content, dict):
+        raise LinkError("the other side closed the link during the greeting")
+    return content
+
+
+def connect(channel: str, hello: dict[str, Any], timeout_s: float = 5.0) -> tuple[socket.socket, dict[str, Any]]:
+    """Attach to a hub and return the link and the hub's answer.
+
+    Raises
+    ------
+    LinkError
+        If there is no such hub, or it refuses.
+    """
+    path = socket_path(channel)
+    link = seqpacket_socket()
+    link.settimeout(timeout_s)
+    try:
+        link.connect(os.fspath(path))
+    except OSError as error:
+        link.close()
+        raise LinkError(
+            f"no hub on hilbus channel {channel!r}: start one with `hil bus --channel {channel}`"
+        ) from error
+    try:
+        send_json(link, {"version": PROTOCOL_VERSION, **hello})
+        answer = receive_json(link)
+    except (LinkError, OSError):
+        link.close()
+        raise
+    if "error" in answer:
+        link.close()
+        raise LinkError(answer["error"])
+    link.settimeout(None)
+    return link, answer

@@ -1,0 +1,213 @@
+"""The wire: a discrete-event simulation that owns time and decides who speaks when.
+
+Time is integer nanoseconds. The next event is the earliest of a frame's end, a node's wake-up, the release of
+a frame to its CAN controller, and arbitration; at the same instant they come in this order, and wake-ups in
+the order in which the nodes were attached.
+"""
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+
+from dbc.frame import EFF_FLAG, Frame
+from dbc.node import Actions, Node
+from hil.bus.wire_time import classic_bits
+
+NEVER = 1 << 62
+INTERMISSION_BITS = 3
+_NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A node's own clock: it starts `phase_ns` after bus time 0 and runs `drift_ppb` fast."""
+
+    phase_ns: int = 0
+    drift_ppb: int = 0
+
+    def local(self, bus_ns: int) -> int:
+        """Return the node's time at bus time `bus_ns`, ns."""
+        elapsed_ns = bus_ns - self.phase_ns
+        return elapsed_ns + elapsed_ns * self.drift_ppb // _NS_PER_S
+
+    def bus(self, local_ns: int) -> int:
+        """Return the first bus time at which the node's clock shows `local_ns` or later, ns."""
+        return self.phase_ns - (-local_ns * _NS_PER_S // (_NS_PER_S + self.drift_ppb))
+
+
+@dataclass(slots=True, eq=False)
+class Port:
+    """A node's place on the wire."""
+
+    node: Node
+    order: int
+    clock: Clock
+    connected: bool = True
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Every frame that ended on the wire, in order: bus time of its end (ns), id, dlc, data."""
+
+    cells: array = field(default_factory=lambda: array("Q"))
+
+    def __len__(self) -> int:
+        return len(self.cells) // 4
+
+
+def arbitration_key(can_id: int) -> int:
+    """Return the number by which identifiers win arbitration: the lower first.
+
+    A standard frame beats an extended one with the same base identifier (ISO 11898-1).
+    """
+    if can_id & EFF_FLAG:
+        base, extension = (can_id >> 18) & 0x7FF, can_id & 0x3FFFF
+        return base << 19 | 1 << 18 | extension
+    return can_id << 19
+
+
+class Wire:
+    """A classic CAN bus between nodes, without errors.
+
+    Parameters
+    ----------
+    bit_rate : int
+        Bit/s.
+    out_of_band : frozenset of int
+        Ids of the bench channel: delivered the moment they are sent, without using the bus.
+    """
+
+    def __init__(self, bit_rate: int, out_of_band: frozenset[int] = frozenset()) -> None:
+        self.bit_rate = bit_rate
+        self.now_ns = 0
+        self.traffic = Traffic()
+        self.busy_ns = 0
+        self.listeners: list[Callable[[int, Frame], None]] = []
+        self._out_of_band = out_of_band
+        self._ports: list[Port] = []
+        self._wakes: list[int] = []
+        self._routes: dict[int, list[Port]] = {}
+        self._released: list[tuple[int, int, Port, Frame]] = []
+        self._pending: list[tuple[int, int, int, Port, Frame]] = []
+        self._sequence = 0
+        self._on_wire: tuple[Port, Frame] | None = None
+        self._end_ns = NEVER
+        self._idle_ns = 0
+
+    def attach(self, node: Node, clock: Clock | None = None) -> Port:
+        """Add a node; it hears nothing of what was already under way.
+
+        Raises
+        ------
+        ValueError
+            If a node of that name is there already.
+        """
+        if any(port.connected and port.node.name == node.name for port in self._ports):
+            raise ValueError(f"there is a node named {node.name!r} on this bus already")
+        port = Port(node, len(self._ports), clock or Clock())
+        self._ports.append(port)
+        self._wakes.append(NEVER)
+        self._routes.clear()
+        return port
+
+    def detach(self, port: Port) -> None:
+        """Cut a node off: it neither hears nor sends, and what it had queued is gone."""
+        port.connected = False
+        self._wakes[port.order] = NEVER
+        self._routes.clear()
+        self._released = sorted(entry for entry in self._released if entry[2] is not port)
+        self._pending = sorted(entry for entry in self._pending if entry[3] is not port)
+
+    def start(self, port: Port) -> None:
+        """Power a node on now."""
+        self._apply(port, port.node.on_start(port.clock.local(self.now_ns)))
+
+    def send(self, port: Port, ready_ns: int, frame: Frame) -> None:
+        """Hand a frame to the port's CAN controller at bus time `ready_ns`."""
+        self._sequence += 1
+        heappush(self._released, (ready_ns, self._sequence, port, frame))
+
+    def next_event_ns(self) -> int:
+        """Return the bus time of the next event, `NEVER` if there is none."""
+        return min(self._end_ns, min(self._wakes, default=NEVER), self._release_ns(), self._arbitration_ns())
+
+    def run(self, until_ns: int) -> None:
+        """Process every event before bus time `until_ns`."""
+        wakes = self._wakes
+        while True:
+            end_ns, wake_ns = self._end_ns, min(wakes, default=NEVER)
+            release_ns, arbitration_ns = self._release_ns(), self._arbitration_ns()
+            event_ns = min(end_ns, wake_ns, release_ns, arbitration_ns)
+            if event_ns >= until_ns:
+                break
+            self.now_ns = event_ns
+            if end_ns == event_ns:
+                self._finish_frame()
+            elif wake_ns == event_ns:
+                self._wake(self._ports[wakes.index(wake_ns)])
+            elif release_ns == event_ns:
+                self._release()
+            else:
+                self._arbitrate()
+        self.now_ns = max(self.now_ns, until_ns)
+
+    def _release_ns(self) -> int:
+        return self._released[0][0] if self._released else NEVER
+
+    def _arbitration_ns(self) -> int:
+        if self._on_wire is not None or not self._pending:
+            return NEVER
+        return max(self._idle_ns, self.now_ns)
+
+    def _wake(self, port: Port) -> None:
+        self._wakes[port.order] = NEVER
+        self._apply(port, port.node.on_timer(port.clock.local(self.now_ns)))
+
+    def _apply(self, port: Port, actions: Actions) -> None:
+        wake_ns, sends = actions
+        if wake_ns is not None:
+            self._wakes[port.order] = max(port.clock.bus(wake_ns), self.now_ns)
+        for send_ns, frame in sends:
+            self.send(port, max(port.clock.bus(send_ns), self.now_ns), frame)
+
+    def _release(self) -> None:
+        _, sequence, port, frame = heappop(self._released)
+        if frame.can_id in self._out_of_band:
+            self._deliver(port, frame)
+        else:
+            heappush(self._pending, (arbitration_key(frame.can_id), port.order, sequence, port, frame))
+
+    def _arbitrate(self) -> None:
+        _, _, _, port, frame = heappop(self._pending)
+        bits = classic_bits(frame.can_id, frame.dlc, frame.data)
+        start_ns = self.now_ns
+        self._on_wire = port, frame
+        self._end_ns = start_ns + (bits - INTERMISSION_BITS) * _NS_PER_S // self.bit_rate
+        self._idle_ns = start_ns + bits * _NS_PER_S // self.bit_rate
+        self.busy_ns += self._idle_ns - start_ns
+
+    def _finish_frame(self) -> None:
+        assert self._on_wire is not None
+        port, frame = self._on_wire
+        self._on_wire, self._end_ns = None, NEVER
+        self._deliver(port, frame)
+
+    def _deliver(self, sender: Port, frame: Frame) -> None:
+        self.traffic.cells.extend((self.now_ns, *frame))
+        for listener in self.listeners:
+            listener(self.now_ns, frame)
+        for port in self._receivers(frame.can_id):
+            if port is not sender:
+                self._apply(port, port.node.on_frame(port.clock.local(self.now_ns), frame))
+
+    def _receivers(self, can_id: int) -> list[Port]:
+        route = self._routes.get(can_id)
+        if route is None:
+            route = [
+                port
+                for port in self._ports
+                if port.connected and (port.node.accepts is None or can_id in port.node.accepts)
+            ]
+            self._routes[can_id] = route
+        return route

@@ -1,0 +1,199 @@
+"""``hil``: the bench's command line."""
+
+import argparse
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from dbc.contract import ContractError
+from hil.bus.hub import Hub, StopFlag
+from hil.bus.link import LinkError
+from hil.bus.wire import Wire
+from hil.measure import result_of, trace_of
+from hil.report import OutputDirectory
+from hil.run.inprocess import run_inprocess
+from hil.run.lockstep import run_lockstep
+from hil.run.node_process import ratio
+from hil.run.options import DEFAULT_BIT_RATE, INTERRUPTED, BenchError, RunOptions
+from hil.run.realtime_bench import run_realtime
+from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
+
+EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
+EXIT_INTERRUPTED = 128 + signal.SIGINT
+
+MODES = {"lockstep": run_lockstep, "inprocess": run_inprocess, "realtime": run_realtime}
+EXIT_CODES = """exit codes: 0 played and within the scenario's limits; 1 played, limits missed;
+2 wrong input; 3 a process was lost; 130 interrupted"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        code: int = arguments.command(arguments)
+    except (BenchError, ScenarioError, ContractError, LinkError, can.CanInitializationError) as error:
+        print(f"hil: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="hil", description="Bench for an integer controller of a hydraulic crane over CAN.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="play a scenario", epilog=EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    run.set_defaults(command=_run)
+    run.add_argument("scenario", help="name (see `hil list`) or .toml file")
+    run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
+    run.add_argument("--mode", choices=MODES, default="lockstep", help="default lockstep")
+    run.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default out/SCENARIO)")
+    run.add_argument("--json", action="store_true", help="print result.json instead of a table")
+    run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log format: .log .asc .blf .trc ...")
+    run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
+    run.add_argument("--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)")
+    run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)")
+    run.add_argument("-i", "--interface", help="realtime: python-can interface (default: a hub of its own)")
+    run.add_argument("-c", "--channel", help="realtime: its channel; lockstep: name that listeners attach to")
+    run.add_argument("--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower")
+    run.add_argument("--start-timeout", type=_seconds, default=120.0, metavar="S", help="for processes to start")
+    run.add_argument("--answer-timeout", type=_seconds, default=10.0, metavar="S", help="for a node to answer")
+
+    bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
+    bus.set_defaults(command=_bus)
+    bus.add_argument("--channel", required=True, help="name to attach to: -i hilbus -c NAME")
+    bus.add_argument("--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)")
+    bus.add_argument("--parent", type=int, help=argparse.SUPPRESS)
+
+    listing = commands.add_parser("list", help="list the built-in scenarios")
+    listing.set_defaults(command=_list)
+    return parser
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} is not a time above 0 s")
+    return value
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    scenario = load_scenario(arguments.scenario, arguments.duration)
+    if not 10_000 <= arguments.bitrate <= 1_000_000:
+        raise BenchError(f"bit rate {arguments.bitrate} is not from 10000 to 1000000 bit/s")
+    if arguments.mode != "realtime" and arguments.interface is not None:
+        raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
+    stopped = StopFlag()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stopped.set)
+    console = Console(stderr=True)
+    out = arguments.out or Path("out") / scenario.name
+    with OutputDirectory(out, arguments.log) as folder:
+        with _progress(console, scenario.name, scenario.duration_s) as progress:
+            options = RunOptions(
+                scenario=scenario,
+                controller=arguments.controller,
+                record_directory=folder.scratch,
+                bit_rate=arguments.bitrate,
+                dbc=arguments.dbc,
+                interface=arguments.interface,
+                channel=arguments.channel,
+                rt_ratio=arguments.rt_ratio,
+                start_timeout_s=arguments.start_timeout,
+                answer_timeout_s=arguments.answer_timeout,
+                progress=progress,
+                stopped=stopped,
+            )
+            recording = MODES[arguments.mode](options)
+        trace = trace_of(recording, scenario)
+        result = result_of(recording, trace, options, arguments.mode)
+        files = folder.write(result, trace, recording.traffic)
+    if arguments.json:
+        print(json.dumps(result, indent=2))
+    else:
+        Console().print(_table(result))
+        print(f"{', '.join(file.name for file in files)} in {out}")
+    if recording.ending:
+        print(f"hil: {recording.ending}", file=sys.stderr)
+    if recording.broken:
+        return EXIT_BROKEN
+    if recording.ending == INTERRUPTED:
+        return EXIT_INTERRUPTED
+    return EXIT_LIMITS if result["within_limits"] is False else EXIT_OK
+
+
+@contextmanager
+def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"{name}: starting", total=duration_s, at="")
+
+        def advance(simulated_s: float) -> None:
+            bar.update(task, completed=simulated_s, description=name, at=f"{simulated_s:.1f} of {duration_s:g} s")
+
+        yield advance
+
+
+def _table(result: dict[str, Any]) -> Table:
+    table = Table(title=f"{result['scenario']}, {result['controller']}, {result['mode']}")
+    table.add_column("")
+    table.add_column("this run", justify="right")
+    table.add_column("limit", justify="right")
+    table.add_column("paper", justify="right")
+    for key, label in (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")):
+        limit, paper = ((source or {}).get(key) for source in (result["limits"], result["paper"]))
+        table.add_row(label, *(_number(value, ".4f") for value in (result[key], limit, paper)))
+    latency = result["latency_us"] or {}
+    rows = (
+        ("speed chatter / rpm per period", _number(result["chatter_rpm_per_period"], ".2f")),
+        ("bus load / %", _number(result["bus_load_percent"], ".1f")),
+        ("feedback to command, median / µs", _number(latency.get("p50"), ".0f")),
+        ("feedback to command, maximum / µs", _number(latency.get("max"), ".0f")),
+        ("start-up / s", _number(result["startup_s"], ".1f")),
+        ("times real time", _number(result["realtime_factor"], ".1f")),
+    )
+    for label, value in rows:
+        table.add_row(label, value, "", "")
+    return table
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _bus(arguments: argparse.Namespace) -> int:
+    stopped = StopFlag()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stopped.set)
+
+    def keep_running() -> bool:
+        orphaned = arguments.parent is not None and os.getppid() != arguments.parent
+        return not (orphaned or stopped.is_set())
+
+    with Hub(Wire(arguments.bitrate), arguments.channel, virtual=False) as hub:
+        print(f"hilbus channel {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True)
+        hub.run_in_wall_time(keep_running)
+        if hub.dropped:
+            print(f"hil: {hub.dropped} frames were dropped for slow listeners", file=sys.stderr)
+    return EXIT_OK
+
+
+def _list(_: argparse.Namespace) -> int:
+    table = Table(box=None)
+    table.add_column("scenario")
+    table.add_column("length / s", justify="right")
+    table.add_column("")
+    for name in builtin_names():
+        scenario = load_scenario(name)
+        table.add_row(name, f"{scenario.duration_s:g}", scenario.title)
+    Console().print(table)
+    return EXIT_OK

@@ -1,0 +1,190 @@
+"""The closed loop without the bus: kernel and plant in one compiled loop, on the bus run's timing chart."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dbc.jit import njit
+from firmware_py.calibration import Calibration
+from firmware_py.compiled import control_reset, control_step
+from firmware_py.kernel.layout import (
+    IO_FLAGS,
+    IO_LAW,
+    IO_POSITION,
+    IO_SATURATIONS,
+    IO_SETPOINT,
+    IO_SIZE,
+    IO_TARGET_VELOCITY,
+    ST_SIZE,
+)
+from hil.references import SETPOINT_LSB_M
+from plant_sim.equilibrium import initial_state
+from plant_sim.integrator import advance
+from plant_sim.layout import POSITION
+from plant_sim.parameters import PlantParameters
+
+PERIOD_S = 1e-3
+SUBSTEPS = 10
+VELOCITY_LSB_RPM = 0.25
+RAD_S_PER_COUNT = math.pi / 120
+MICROMETRES_PER_METRE = 1e6
+
+
+@njit(
+    "void(int32[::1], int32[::1], int32[::1], float64[::1], float64[::1], int32[::1], float64[::1],"
+    " int64, int64, int64, float64[::1], int32[::1], int32[::1], int32[:,::1])",
+    depends=("firmware_py.compiled", "firmware_py.kernel", "plant_sim"),
+)
+def _run(  # type: ignore[no-untyped-def]
+    calibration,
+    state,
+    io,
+    plant,
+    parameters,
+    setpoint,
+    load,
+    position_lsb_um,
+    delay_periods,
+    hold_periods,
+    position,
+    velocity,
+    flags,
+    states,
+):
+    """Fill `position` (m), `velocity` (0.25 rpm), `flags` and `states`, a row for each period."""
+    pending = np.zeros(delay_periods, np.int32)
+    for tick in range(-hold_periods, setpoint.size):
+        k = max(tick, 0)
+        position[k] = plant[POSITION]
+        count = math.floor(plant[POSITION] * MICROMETRES_PER_METRE / position_lsb_um + 0.5)
+        io[IO_POSITION] = count * position_lsb_um
+        io[IO_SETPOINT] = setpoint[k]
+        if tick == -hold_periods:
+            control_reset(calibration, state, io)
+        control_step(calibration, state, io)
+        velocity[k] = io[IO_TARGET_VELOCITY]
+        flags[k] = io[IO_FLAGS]
+        states[k] = state
+        slot = (tick + hold_periods) % delay_periods
+        held = pending[slot]
+        pending[slot] = io[IO_TARGET_VELOCITY]
+        advance(plant, parameters, held * RAD_S_PER_COUNT, load[k], PERIOD_S, SUBSTEPS)
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedLoopRun:
+    """One row per control period k, at t_k = k ms.
+
+    Attributes
+    ----------
+    reference_m : ndarray of float64
+        r(t_k) as given, rounded to the setpoint's 0.1 um.
+    position_m : ndarray of float64
+        The plant's unquantised x(t_k).
+    command_rpm : ndarray of float64
+        Speed commanded from x(t_k) and r(t_k); the drive holds it from t_k + delay on.
+    flags : ndarray of int32
+        `FLAG_*` of `firmware_py.kernel.layout`.
+    states : ndarray of int32, shape (periods, ST_SIZE)
+        The kernel's state after the tick, indexed by `ST_*`.
+    saturations : int
+        States that hit their 32-bit range over the run.
+    """
+
+    reference_m: np.ndarray
+    position_m: np.ndarray
+    command_rpm: np.ndarray
+    flags: np.ndarray
+    states: np.ndarray
+    saturations: int
+
+    @property
+    def error_m(self) -> np.ndarray:
+        """r(t_k) - x(t_k)."""
+        return self.reference_m - self.position_m
+
+    @property
+    def rms_mm(self) -> float:
+        """RMS of the error over the run."""
+        return float(np.sqrt(np.mean(self.error_m**2))) * 1e3
+
+    @property
+    def max_mm(self) -> float:
+        """Largest error magnitude."""
+        return float(np.max(np.abs(self.error_m))) * 1e3
+
+    @property
+    def chatter_rpm(self) -> float:
+        """RMS of the first difference of the commanded speed, rpm per period."""
+        return float(np.sqrt(np.mean(np.diff(self.command_rpm) ** 2)))
+
+
+def run_closed_loop(
+    calibration: Calibration,
+    setpoint: np.ndarray,
+    load_n: np.ndarray,
+    *,
+    law: int | None = None,
+    parameters: PlantParameters | None = None,
+    position_lsb_um: int = 1,
+    delay_periods: int = 1,
+    hold_periods: int = 0,
+) -> ClosedLoopRun:
+    """Run kernel and plant over a whole reference.
+
+    The command computed from x(t_k) is held over [t_k+delay, t_k+delay+1); before the first one the drive
+    is at rest.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    setpoint : ndarray of int32
+        Reference at each t_k in 0.1 um.
+    load_n : ndarray of float64
+        External load over [t_k, t_k+1), N.
+    law : int, optional
+        Control law, instead of the calibration's default.
+    parameters : PlantParameters, optional
+        The machine, nominal if not given.
+    position_lsb_um : int
+        Resolution of the position sensor, um.
+    delay_periods : int
+        Transport delay, at least 1.
+    hold_periods : int
+        Periods at the first setpoint and load before k = 0.
+    """
+    if setpoint.shape != load_n.shape or delay_periods < 1 or position_lsb_um < 1 or hold_periods < 0:
+        raise ValueError("closed loop: setpoint and load differ in length, or an option is out of range")
+    parameters = parameters or PlantParameters()
+    io: Any = np.zeros(IO_SIZE, np.int32)
+    io[IO_LAW] = calibration.law if law is None else law
+    position = np.empty(setpoint.size)
+    velocity = np.empty(setpoint.size, np.int32)
+    flags = np.empty(setpoint.size, np.int32)
+    states = np.empty((setpoint.size, ST_SIZE), np.int32)
+    _run(
+        calibration.array(),
+        np.zeros(ST_SIZE, np.int32),
+        io,
+        initial_state(parameters),
+        parameters.vector(),
+        np.ascontiguousarray(setpoint, np.int32),
+        np.ascontiguousarray(load_n, np.float64),
+        position_lsb_um,
+        delay_periods,
+        hold_periods,
+        position,
+        velocity,
+        flags,
+        states,
+    )
+    return ClosedLoopRun(
+        reference_m=setpoint * SETPOINT_LSB_M,
+        position_m=position,
+        command_rpm=velocity * VELOCITY_LSB_RPM,
+        flags=flags,
+        states=states,
+        saturations=int(io[IO_SATURATIONS]),
+    )

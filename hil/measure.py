@@ -1,0 +1,165 @@
+"""From what a run left to a trace by control period and to figures."""
+
+import hashlib
+import math
+from typing import Any
+
+import numpy as np
+
+from dbc.contract import Contract
+from dbc.node import PERIOD_NS
+from firmware_py.node import EXECUTION_NS, PHASE_NS
+from hil.bus.wire import INTERMISSION_BITS
+from hil.bus.wire_time import classic_bits
+from hil.run.options import Recording, RunOptions
+from hil.scenario import PERIOD_S, Scenario
+
+M_TO_MM = 1e3
+PA_TO_BAR = 1e-5
+RAD_S_TO_RPM = 30.0 / math.pi
+LSB_POSITION_M = 2.0**-31
+LSB_VELOCITY_M_S = 2.0**-38 / PERIOD_S
+LSB_ACCELERATION_M_S2 = 2.0**-40 / PERIOD_S**2
+LSB_DISTURBANCE_M_S3 = 2.0**-42 / PERIOD_S**3
+
+PLANT_COLUMNS = (  # trace column, record column, factor
+    ("position_m", "position_m", 1.0),
+    ("velocity_m_s", "velocity_m_s", 1.0),
+    ("pressure_a_bar", "pressure_a_pa", PA_TO_BAR),
+    ("pressure_b_bar", "pressure_b_pa", PA_TO_BAR),
+    ("pressure_accumulator_bar", "pressure_accumulator_pa", PA_TO_BAR),
+    ("motor_speed_rpm", "motor_speed_rad_s", RAD_S_TO_RPM),
+    ("load_n", "load_n", 1.0),
+    ("drive_state", "drive_state", 1.0),
+)
+CONTROLLER_COLUMNS = (
+    ("position_measured_m", "position_um", 1e-6),
+    ("target_velocity_rpm", "target_velocity_0p25rpm", 0.25),
+    ("controller_state", "state", 1.0),
+    ("controller_faults", "faults", 1.0),
+    ("td_position_m", "v1", LSB_POSITION_M),
+    ("td_velocity_m_s", "v2", LSB_VELOCITY_M_S),
+    ("td_acceleration_m_s2", "v3", LSB_ACCELERATION_M_S2),
+    ("eso_position_m", "z1", LSB_POSITION_M),
+    ("eso_velocity_m_s", "z2", LSB_VELOCITY_M_S),
+    ("eso_acceleration_m_s2", "z3", LSB_ACCELERATION_M_S2),
+    ("eso_disturbance_m_s3", "z4", LSB_DISTURBANCE_M_S3),
+)
+
+Trace = dict[str, np.ndarray]
+
+
+def trace_of(recording: Recording, scenario: Scenario) -> Trace:
+    """Merge the nodes' records by control period.
+
+    Returns
+    -------
+    trace : dict of ndarray
+        One row per control period k = 0, 1, ... of the scenario that was played; NaN where a node has no row.
+    """
+    played = round(recording.simulated_s / PERIOD_S) - _first_period(recording)
+    rows = max(min(played, scenario.periods), 0)
+    trace = {"time_s": np.arange(rows) * PERIOD_S, "reference_m": scenario.reference_m()[:rows]}
+    sources = ((recording.plant, PLANT_COLUMNS, 0), (recording.controller, CONTROLLER_COLUMNS, PHASE_NS))
+    for record, columns, phase_ns in sources:
+        if record is None:
+            continue
+        period = ((record["time_ns"] + phase_ns - recording.start_ns) // PERIOD_NS).astype(int)
+        inside = (period >= 0) & (period < rows)
+        for name, source, factor in columns:
+            trace[name] = np.full(rows, np.nan)
+            trace[name][period[inside]] = record[source][inside] * factor
+    if "position_m" in trace:
+        trace["error_m"] = trace["reference_m"] - trace["position_m"]
+    return trace
+
+
+def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str) -> dict[str, Any]:
+    """Return the figures of a run, as written to ``result.json``.
+
+    RMS and maximum are over e(t_k) = r(t_k) - x(t_k), x being the plant's unquantised position.
+    """
+    contract = Contract.load(options.dbc)
+    scenario = options.scenario
+    error_mm = trace.get("error_m", np.full(1, np.nan)) * M_TO_MM
+    speed_rpm = trace.get("target_velocity_rpm", np.full(2, np.nan))
+    rms_mm = _finite(np.sqrt(np.nanmean(error_mm**2))) if np.isfinite(error_mm).any() else None
+    max_mm = _finite(np.nanmax(np.abs(error_mm))) if np.isfinite(error_mm).any() else None
+    limits = scenario.limits.get(options.controller)
+    complete = not recording.ending
+    within = None
+    if limits and complete and rms_mm is not None and max_mm is not None:
+        within = rms_mm <= limits["rms_mm"] and max_mm <= limits["max_mm"]
+    bits = frame_lengths(recording.traffic)
+    return {
+        "scenario": scenario.name,
+        "controller": options.controller,
+        "mode": mode,
+        "complete": complete,
+        "ending": recording.ending,
+        "rms_mm": rms_mm,
+        "max_mm": max_mm,
+        "chatter_rpm_per_period": _finite(np.sqrt(np.nanmean(np.diff(speed_rpm) ** 2))) if len(speed_rpm) > 1 else None,
+        "limits": limits,
+        "within_limits": within,
+        "paper": scenario.paper.get(options.controller),
+        "bit_rate": options.bit_rate,
+        "bus_load_percent": bus_load_percent(recording, bits, contract, options.bit_rate),
+        "latency_us": latency_us(recording, bits, contract, options.bit_rate),
+        "bus_frames": len(recording.traffic),
+        "bus_sha256": hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest(),
+        "scenario_start_bus_s": recording.start_ns / 1e9,
+        "simulated_s": recording.simulated_s,
+        "wall_s": recording.wall_s,
+        "startup_s": recording.startup_s,
+        "realtime_factor": recording.simulated_s / recording.wall_s,
+        "notes": recording.notes,
+    }
+
+
+def frame_lengths(traffic: np.ndarray) -> np.ndarray:
+    """Return each frame's length in bits, interframe space included."""
+    return np.array([classic_bits(can_id, dlc, data) for _, can_id, dlc, data in traffic.tolist()], dtype=np.int64)
+
+
+def bus_load_percent(recording: Recording, bits: np.ndarray, contract: Contract, bit_rate: int) -> float:
+    """Return the share of bus time in use, the bench channel left out."""
+    bench = [message.can_id for message in contract.messages if message.bench_channel]
+    counted = ~np.isin(recording.traffic[:, 1], np.array(bench, dtype=np.uint64))
+    return float(100.0 * bits[counted].sum() / bit_rate / recording.simulated_s)
+
+
+def latency_us(
+    recording: Recording, bits: np.ndarray, contract: Contract, bit_rate: int
+) -> dict[str, float] | None:
+    """Return percentiles of the bus time from a feedback's end to the end of the command made from it, µs.
+
+    A command belongs to the last controller period that began an execution time or more before the command
+    started on the bus, and was made from the newest PositionFeedback that had ended at that period's begin.
+    """
+    traffic, controller = recording.traffic, recording.controller
+    if controller is None:
+        return None
+    ends_ns = traffic[:, 0].astype(np.int64)
+    feedback_ns = ends_ns[traffic[:, 1] == contract.position_feedback.can_id]
+    is_command = traffic[:, 1] == contract.drive_command.can_id
+    command_ns = ends_ns[is_command]
+    starts_ns = command_ns - (bits[is_command] - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
+    timer_ns = controller["time_ns"] + PHASE_NS
+    period = np.searchsorted(timer_ns, starts_ns - EXECUTION_NS, side="right") - 1
+    newest = np.searchsorted(feedback_ns, timer_ns[period], side="right") - 1
+    known = (period >= 0) & (newest >= 0)
+    if not known.any():
+        return None
+    latency = (command_ns[known] - feedback_ns[newest[known]]) / 1e3
+    p50, p99 = np.percentile(latency, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "max": float(latency.max())}
+
+
+def _first_period(recording: Recording) -> int:
+    """Periods that were played before the scenario's first one."""
+    return round((recording.start_ns - int(recording.supervisor["time_ns"][0])) / PERIOD_NS)
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

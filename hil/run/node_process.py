@@ -1,0 +1,159 @@
+"""The command line and main loop that every node process shares."""
+
+import argparse
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Protocol
+
+import can
+
+from dbc.contract import ContractError
+from dbc.node import Actions, Node
+from dbc.record import Record
+from hil.bus import link
+from hil.bus.hilbus import HilBus
+from hil.bus.hub import StopFlag
+from hil.bus.link import LinkError
+from hil.bus.wire import Clock
+from hil.run.realtime import DuplicateNodeError, RealtimeNode
+
+EXIT_USAGE = 2
+EXIT_BROKEN = 3
+
+
+class RecordingNode(Node, Protocol):
+    """A node that writes down what it saw of itself."""
+
+    record: Record
+
+
+def add_node_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that both sides share; -i, -c and -b are python-can's."""
+    parser.add_argument("-i", "--interface", help="python-can interface (default: python-can's configuration)")
+    parser.add_argument("-c", "--channel", help="channel of the interface, e.g. vcan0 or a hilbus name")
+    parser.add_argument("-b", "--bitrate", type=int, help="bit/s, for adapters that set it")
+    parser.add_argument("--rt-ratio", type=ratio, default=Fraction(1), metavar="R", help="node time per wall time")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="write NAME.npz there at the end")
+    parser.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)")
+    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
+
+
+def ratio(text: str) -> Fraction:
+    """Return a real-time ratio given as a decimal or a fraction.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If it is not above 0 and at most 1.
+    """
+    try:
+        value = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        value = Fraction(0)
+    if not 0 < value <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above 0 and at most 1")
+    return value
+
+
+def node_main(
+    parser: argparse.ArgumentParser,
+    build: Callable[[argparse.Namespace], RecordingNode],
+    clock: Clock,
+    argv: list[str] | None,
+) -> int:
+    """Parse the arguments, run the node until it is stopped, and return the exit code."""
+    arguments = parser.parse_args(argv)
+    try:
+        node = build(arguments)
+        if arguments.interface == "hilbus" and arguments.channel:
+            connection, answer = link.connect(arguments.channel, _hello(node))
+            if answer["virtual"]:
+                serve(node, connection, arguments.channel)
+            else:
+                bus = HilBus(arguments.channel, greeted=(connection, answer))
+                _run_in_wall_time(node, bus, arguments, clock)
+        else:
+            given = {key: getattr(arguments, key) for key in ("interface", "channel", "bitrate")}
+            bus = can.Bus(**{key: value for key, value in given.items() if value is not None})
+            _run_in_wall_time(node, bus, arguments, clock)
+        if arguments.record:
+            node.record.save(arguments.record / f"{node.name}.npz")
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except (ContractError, DuplicateNodeError, can.CanInitializationError, can.CanInterfaceNotImplementedError) as e:
+        return _complain(parser, e, EXIT_USAGE)
+    except (LinkError, can.CanError, OSError) as error:
+        return _complain(parser, error, EXIT_BROKEN)
+    return 0
+
+
+def serve(node: Node, connection: socket.socket, channel: str) -> None:
+    """Answer the hub's events in virtual time until it says stop.
+
+    Raises
+    ------
+    LinkError
+        If the hub goes away without saying so.
+    """
+    with connection:
+        while True:
+            try:
+                packet = connection.recv(link.MAX_PACKET)
+            except OSError:
+                packet = b""
+            if not packet:
+                raise LinkError(f"the hub of channel {channel!r} ended without a stop: is the bench still there?")
+            kind, now_ns, frames = link.unpack_event(packet)
+            if kind == link.STOP:
+                return
+            actions = Actions()
+            for time_ns, frame in frames:
+                actions = node.on_frame(time_ns, frame)
+            if kind == link.TIMER:
+                actions = node.on_timer(now_ns)
+            elif kind == link.START:
+                actions = node.on_start(now_ns)
+            connection.send(link.pack_actions(actions))
+
+
+def _hello(node: Node) -> dict[str, object]:
+    return {
+        "role": "node",
+        "name": node.name,
+        "accepts": None if node.accepts is None else sorted(node.accepts),
+        "latched": sorted(node.latched),
+        "transmits": sorted(node.transmits),
+    }
+
+
+def _run_in_wall_time(node: Node, bus: can.BusABC, arguments: argparse.Namespace, clock: Clock) -> None:
+    stopped = StopFlag()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stopped.set)
+
+    def keep_running() -> bool:
+        if arguments.parent is not None and os.getppid() != arguments.parent:
+            raise LinkError("the bench that started this process has ended")
+        return not stopped.is_set()
+
+    with bus:
+        runner = RealtimeNode(node, bus, arguments.rt_ratio, clock)
+        runner.listen_for_duplicate()
+        print(f"{node.name} is on {bus.channel_info}; Ctrl-C ends it", file=sys.stderr, flush=True)
+        runner.run(keep_running)
+    late = runner.lateness.summary()
+    print(
+        f"{node.name}: timer late by {late['p50_us']:.0f} µs (median), {late['p99_us']:.0f} µs (p99), "
+        f"{late['max_us']:.0f} µs (max); {late['overruns']} periods missed",
+        file=sys.stderr,
+    )
+
+
+def _complain(parser: argparse.ArgumentParser, error: Exception, code: int) -> int:
+    print(f"{parser.prog}: {error}", file=sys.stderr)
+    return code

@@ -1,0 +1,97 @@
+"""What a run is asked for, and what it leaves for the measurements."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from hil.bus.hub import StopFlag
+from hil.scenario import Scenario
+
+DEFAULT_BIT_RATE = 1_000_000
+INTERRUPTED = "interrupted"
+"""`Recording.ending` of a run that was asked to stop."""
+
+
+class BenchError(Exception):
+    """The run cannot start: the message says what is wrong and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """One run.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        What is played.
+    controller : str
+        Control law, one of `hil.scenario.CONTROLLERS`.
+    record_directory : Path
+        Private directory for what processes leave.
+    bit_rate : int
+        Bit/s of the wire.
+    dbc : Path or None
+        Another DBC than the packaged one.
+    interface, channel : str or None
+        python-can interface of a real-time run; in lock-step the hub's channel.
+    rt_ratio : Fraction
+        Simulated time per wall time of a real-time run.
+    start_timeout_s, answer_timeout_s : float
+        Wall time for processes to come up, and to answer one event, s.
+    progress : callable
+        Told the simulated time, s.
+    stopped : StopFlag
+        Ends the run early.
+    """
+
+    scenario: Scenario
+    controller: str
+    record_directory: Path
+    bit_rate: int = DEFAULT_BIT_RATE
+    dbc: Path | None = None
+    interface: str | None = None
+    channel: str | None = None
+    rt_ratio: Fraction = Fraction(1)
+    start_timeout_s: float = 120.0
+    answer_timeout_s: float = 10.0
+    progress: Callable[[float], None] = lambda simulated_s: None
+    stopped: StopFlag = field(default_factory=StopFlag)
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What a run left.
+
+    Attributes
+    ----------
+    traffic : ndarray of uint64, shape (frames, 4)
+        Bus time of each frame's end (ns), id, dlc, data.
+    supervisor, plant, controller : dict of ndarray, or None
+        The nodes' records; None if the process did not live to write it.
+    start_ns : int
+        Bus time of the scenario's first period.
+    simulated_s, wall_s, startup_s : float
+        Simulated time; wall time it took; wall time before it, s.
+    ending : str
+        Empty if the scenario was played to its end, else what ended it.
+    broken : bool
+        Whether a process was lost.
+    notes : dict
+        What only some modes have: frames injected, drops, lateness.
+    """
+
+    traffic: np.ndarray
+    supervisor: dict[str, np.ndarray]
+    plant: dict[str, np.ndarray] | None
+    controller: dict[str, np.ndarray] | None
+    start_ns: int
+    simulated_s: float
+    wall_s: float
+    startup_s: float
+    ending: str = ""
+    broken: bool = False
+    notes: dict[str, object] = field(default_factory=dict)
+

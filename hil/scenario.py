@@ -1,0 +1,134 @@
+"""A scenario is data: reference, load profile, duration and the limits the run must meet."""
+
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dbc.node import PERIOD_NS
+from hil.references import REFERENCES
+
+CONTROLLERS = ("p", "pi", "adrc")
+PERIOD_S = PERIOD_NS * 1e-9
+
+
+class ScenarioError(ValueError):
+    """A scenario does not exist or does not make sense; the message says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What the supervisor does to the closed loop, and what must come of it.
+
+    Attributes
+    ----------
+    name : str
+        File name without suffix.
+    title : str
+        One line for lists.
+    reference : str
+        Key of `hil.references.REFERENCES`.
+    duration_s : float
+        Length from the start of the reference, s.
+    load : tuple of (float, float)
+        Steps of the external load: time (s) and force (N, negative helps extension).
+    limits : dict
+        For each controller that has to meet one, `rms_mm` and `max_mm`.
+    paper : dict
+        The paper's figures for each controller, `rms_mm` and `max_mm`; empty if it has none.
+    """
+
+    name: str
+    title: str
+    reference: str
+    duration_s: float
+    load: tuple[tuple[float, float], ...]
+    limits: dict[str, dict[str, float]]
+    paper: dict[str, dict[str, float]]
+
+    @property
+    def periods(self) -> int:
+        """Number of control periods."""
+        return round(self.duration_s / PERIOD_S)
+
+    def reference_m(self) -> np.ndarray:
+        """Return the reference at the start of each period, m."""
+        return REFERENCES[self.reference](np.arange(self.periods) * PERIOD_S)
+
+
+def builtin_names() -> list[str]:
+    """Return the names of the scenarios in the package."""
+    files = resources.files("hil.scenarios").iterdir()
+    return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
+
+
+def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
+    """Return a built-in scenario by name, or one from a ``.toml`` file.
+
+    Parameters
+    ----------
+    name : str
+        Name or path.
+    duration_s : float, optional
+        Cut it short, s.
+
+    Raises
+    ------
+    ScenarioError
+        If there is none of that name, or a key is missing, unknown or has a wrong value.
+    """
+    if name.endswith(".toml"):
+        path = Path(name)
+        if not path.is_file():
+            raise ScenarioError(f"there is no scenario file {name}")
+        text = path.read_text(encoding="utf-8")
+    elif name in builtin_names():
+        path = Path(name)
+        text = resources.files("hil.scenarios").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+    else:
+        known = ", ".join(builtin_names())
+        raise ScenarioError(f"unknown scenario {name!r}: choose one of {known}, or give a .toml file")
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{name}: {error}") from error
+    if duration_s is not None:
+        content["duration_s"] = duration_s
+    return _checked(path.stem, content)
+
+
+def _checked(name: str, content: dict[str, Any]) -> Scenario:
+    required = {"title", "reference", "duration_s"}
+    optional = {"load", "limits", "paper"}
+    if missing := sorted(required - set(content)):
+        raise ScenarioError(f"{name}: missing key {missing[0]!r}")
+    if unknown := sorted(set(content) - required - optional):
+        allowed = ", ".join(sorted(required | optional))
+        raise ScenarioError(f"{name}: unknown key {unknown[0]!r}; allowed are {allowed}")
+    if content["reference"] not in REFERENCES:
+        raise ScenarioError(f"{name}: reference {content['reference']!r} is not one of {', '.join(REFERENCES)}")
+    duration_s = content["duration_s"]
+    if not isinstance(duration_s, int | float) or not PERIOD_S <= duration_s <= 3600:
+        raise ScenarioError(f"{name}: duration_s is {duration_s!r}, must be from {PERIOD_S} to 3600 s")
+    try:
+        load = tuple((float(time_s), float(force_n)) for time_s, force_n in content.get("load", []))
+    except (TypeError, ValueError) as error:
+        raise ScenarioError(f"{name}: load must be a list of [time_s, force_n]") from error
+    for key in ("limits", "paper"):
+        for controller, figures in content.get(key, {}).items():
+            if controller not in CONTROLLERS or set(figures) != {"rms_mm", "max_mm"}:
+                raise ScenarioError(
+                    f"{name}: {key}.{controller} must be one of {', '.join(CONTROLLERS)} with rms_mm and max_mm"
+                )
+    return Scenario(
+        name=name,
+        title=content["title"],
+        reference=content["reference"],
+        duration_s=float(duration_s),
+        load=load,
+        limits=content.get("limits", {}),
+        paper=content.get("paper", {}),
+    )

@@ -1,0 +1,175 @@
+"""The machine's node: drive, position sensor and pressure sensors around the simulated plant."""
+
+import math
+
+from dbc.contract import Contract
+from dbc.e2e import ACCEPTED, Checker, Protector
+from dbc.frame import Frame
+from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
+from dbc.record import Record
+from plant_sim import layout as at
+from plant_sim.drive import COUNTS_PER_RPM, Drive
+from plant_sim.equilibrium import initial_state
+from plant_sim.hydraulics import accumulator_pressure
+from plant_sim.integrator import advance
+from plant_sim.parameters import PlantParameters
+from plant_sim.sensors import PositionSensor, pressure_count
+
+SUBSTEPS = 10
+BENCH_RESET = 1
+
+_PERIOD_S = PERIOD_NS * 1e-9
+_STATUS_PERIODS = 10
+_STATUS_PHASE = 2
+_PRESSURE_PHASE = 4
+_COUNTS_PER_RAD_S = 30.0 * COUNTS_PER_RPM / math.pi
+_RESET_LSB_M = 1e-7
+_SENSOR_OK = 0
+
+
+class Plant:
+    """Drive, sensors and plant on one 1 ms clock.
+
+    At each timer call the plant is brought up to now, the position is sampled and sent, and the drive takes the
+    newest DriveCommand and holds it for one period.
+
+    Parameters
+    ----------
+    contract : Contract
+        The DBC.
+    parameters : PlantParameters
+        The machine.
+    sensor : PositionSensor, optional
+        Default: 1 µm, no noise.
+
+    Attributes
+    ----------
+    record : Record
+        One row per period: the state at its start and what acts during it, SI units.
+    """
+
+    name = "plant"
+
+    def __init__(
+        self, contract: Contract, parameters: PlantParameters, sensor: PositionSensor | None = None
+    ) -> None:
+        self._contract = contract
+        self._parameters = parameters
+        self._vector = parameters.vector()
+        self._sensor = sensor or PositionSensor()
+        self.accepts = frozenset(
+            message.can_id
+            for message in (contract.drive_command, contract.bench_control, contract.bench_load)
+        )
+        self.latched = self.accepts
+        self.transmits = frozenset(
+            message.can_id
+            for message in (contract.position_feedback, contract.drive_status, contract.pressure_feedback)
+        )
+        self.record = Record(
+            (
+                "time_ns",
+                "position_m",
+                "velocity_m_s",
+                "pressure_a_pa",
+                "pressure_b_pa",
+                "pressure_accumulator_pa",
+                "motor_speed_rad_s",
+                "speed_command_rad_s",
+                "load_n",
+                "drive_state",
+            ),
+            "d",
+        )
+
+    def on_start(self, now_ns: int) -> Actions:
+        """Power-on: at rest, retracted, drive off."""
+        contract = self._contract
+        self._check = Checker(contract.drive_command.data_ids, contract.drive_command.dlc).check
+        self._protect_position = _protector(contract.position_feedback)
+        self._protect_status = _protector(contract.drive_status)
+        self._mailbox: dict[int, Frame] = {}
+        self._time_ns = next_period(now_ns)
+        self._restart(0.0)
+        return Actions(self._time_ns)
+
+    def on_frame(self, now_ns: int, frame: Frame) -> Actions:
+        """Latch: the newest frame of each id."""
+        self._mailbox[frame.can_id] = frame
+        return NOTHING
+
+    def on_timer(self, now_ns: int) -> Actions:
+        """Simulate up to now, send what the sensors say, and let the drive take its command."""
+        contract = self._contract
+        self._take_bench_frames()
+        state = self._state
+        while self._time_ns + PERIOD_NS <= now_ns:
+            advance(state, self._vector, self._speed_command_rad_s, self._load_n, _PERIOD_S, SUBSTEPS)
+            self._time_ns += PERIOD_NS
+        position_m, velocity_m_s, pressure_a_pa, pressure_b_pa, speed_rad_s, oil_m3 = state.tolist()
+        accumulator_pa = accumulator_pressure(oil_m3, self._vector)
+
+        feedback = contract.position_feedback
+        payload = self._protect_position(feedback.pack(_SENSOR_OK, self._sensor.read(position_m)))
+        sends = [(now_ns, Frame(feedback.can_id, feedback.dlc, payload))]
+
+        self._speed_command_rad_s = self._drive.step(self._drive_command())
+        phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
+        if phase == _STATUS_PHASE:
+            status = contract.drive_status
+            counts = round(speed_rad_s * _COUNTS_PER_RAD_S)
+            payload = self._protect_status(status.pack(self._drive.statusword, counts))
+            sends.append((now_ns, Frame(status.can_id, status.dlc, payload)))
+        elif phase == _PRESSURE_PHASE:
+            pressure = contract.pressure_feedback
+            counts3 = (pressure_count(pa) for pa in (pressure_a_pa, pressure_b_pa, accumulator_pa))
+            sends.append((now_ns, Frame(pressure.can_id, pressure.dlc, pressure.pack(*counts3))))
+        self.record.append(
+            (
+                self._time_ns,
+                position_m,
+                velocity_m_s,
+                pressure_a_pa,
+                pressure_b_pa,
+                accumulator_pa,
+                speed_rad_s,
+                self._speed_command_rad_s,
+                self._load_n,
+                self._drive.state,
+            )
+        )
+        return Actions(self._time_ns + PERIOD_NS, tuple(sends))
+
+    def _restart(self, position_m: float) -> None:
+        self._state = initial_state(self._parameters, position_m)
+        self._drive = Drive(
+            self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2
+        )
+        self._speed_command_rad_s = 0.0
+        self._load_n = 0.0
+
+    def _take_bench_frames(self) -> None:
+        contract = self._contract
+        frame = self._mailbox.pop(contract.bench_control.can_id, None)
+        if frame is not None:
+            control = contract.bench_control.unpack(frame.data)
+            if control.command == BENCH_RESET:
+                self._restart(control.value * _RESET_LSB_M)
+        frame = self._mailbox.pop(contract.bench_load.can_id, None)
+        if frame is not None:
+            self._load_n = float(contract.bench_load.unpack(frame.data).force)
+
+    def _drive_command(self) -> tuple[int, int] | None:
+        message = self._contract.drive_command
+        frame = self._mailbox.pop(message.can_id, None)
+        if frame is None or frame.dlc != message.dlc:
+            self._check(None)
+            return None
+        if self._check(frame.data) not in ACCEPTED:
+            return None
+        command = message.unpack(frame.data)
+        return command.controlword, command.target_velocity
+
+
+def _protector(message):
+    return Protector(message.data_ids, message.dlc).protect

@@ -1,0 +1,211 @@
+"""Each fixed-point helper against Python's big integers, on checked integers and compiled."""
+
+import math
+from fractions import Fraction
+
+import numba
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+import firmware_py.compiled  # noqa: F401  (makes the kernel callable from jitted code)
+from firmware_py import checked
+from firmware_py.kernel import fal, fixedpoint, machine, td, units
+
+INT32 = st.integers(-(2**31), 2**31 - 1)
+INT64 = st.integers(-(2**63), 2**63 - 1)
+POSITIVE32 = st.integers(1, 2**31 - 1)
+SHIFT = st.integers(1, 62)
+
+
+@numba.njit
+def compiled_isqrt(value):
+    return fixedpoint.isqrt(value)
+
+
+@numba.njit
+def compiled_div(dividend, divisor):
+    return machine.div(dividend, divisor)
+
+
+@numba.njit
+def compiled_mul_q(value, mantissa, shift):
+    return fixedpoint.mul_q(value, mantissa, shift)
+
+
+@numba.njit
+def compiled_sat32(value):
+    return fixedpoint.sat32(value)
+
+
+@numba.njit
+def compiled_fal_1_2(e, delta):
+    return fal.fal_1_2(e, delta)
+
+
+@numba.njit
+def compiled_fal_3_4(e, delta):
+    return fal.fal_3_4(e, delta)
+
+
+@numba.njit
+def compiled_fhan(x1, a0, r, d):
+    return td.fhan(x1, a0, r, d)
+
+
+MODULES = checked.load()
+
+
+def wide(function):
+    """Call a checked kernel function with 64-bit arguments."""
+    return lambda *arguments: int(function(*map(checked.i64, arguments)))
+
+
+def narrow(function):
+    """Call a checked kernel function with 32-bit arguments."""
+    return lambda *arguments: int(function(*map(checked.i32, arguments)))
+
+
+FIXED = MODULES["fixedpoint"]
+ISQRT = pytest.mark.parametrize("isqrt", [wide(FIXED.isqrt), compiled_isqrt], ids=["checked", "compiled"])
+DIV = pytest.mark.parametrize(
+    "div", [wide(MODULES["machine"].div), compiled_div], ids=["checked", "compiled"]
+)
+MUL_Q = pytest.mark.parametrize("mul_q", [narrow(FIXED.mul_q), compiled_mul_q], ids=["checked", "compiled"])
+SAT32 = pytest.mark.parametrize("sat32", [wide(FIXED.sat32), compiled_sat32], ids=["checked", "compiled"])
+FAL_1_2 = pytest.mark.parametrize(
+    "fal_1_2", [narrow(MODULES["fal"].fal_1_2), compiled_fal_1_2], ids=["checked", "compiled"]
+)
+FAL_3_4 = pytest.mark.parametrize(
+    "fal_3_4", [narrow(MODULES["fal"].fal_3_4), compiled_fal_3_4], ids=["checked", "compiled"]
+)
+FHAN = pytest.mark.parametrize("fhan", [wide(MODULES["td"].fhan), compiled_fhan], ids=["checked", "compiled"])
+
+
+@ISQRT
+@given(value=st.integers(0, 2**63 - 1))
+def test_isqrt_is_the_floor_of_the_square_root(isqrt, value):
+    assert isqrt(value) == math.isqrt(value)
+
+
+@ISQRT
+def test_isqrt_around_squares_and_powers_of_four(isqrt):
+    roots = [1, 2, 3, 46340, 46341, 2**31 - 1, 2**31, 3037000499]
+    values = [4**n for n in range(31)] + [root**2 for root in roots]
+    for value in values:
+        for neighbour in (value - 1, value, value + 1):
+            assert isqrt(neighbour) == math.isqrt(neighbour), neighbour
+
+
+@DIV
+@given(dividend=INT64, divisor=st.integers(1, 2**63 - 1))
+@example(dividend=-7, divisor=2)
+@example(dividend=-(2**63) + 1, divisor=1)
+def test_div_truncates_towards_zero_as_c_does(div, dividend, divisor):
+    if dividend == -(2**63):
+        dividend += 1
+    assert div(dividend, divisor) == math.trunc(Fraction(dividend, divisor))
+
+
+@MUL_Q
+@given(value=INT32, mantissa=INT32, shift=SHIFT)
+@example(value=-1, mantissa=1, shift=1)
+@example(value=-(2**31), mantissa=-(2**31), shift=62)
+def test_mul_q_rounds_half_up(mul_q, value, mantissa, shift):
+    assert mul_q(value, mantissa, shift) == math.floor(Fraction(value * mantissa, 2**shift) + Fraction(1, 2))
+
+
+@SAT32
+@given(value=INT64)
+@example(value=2**31 - 1)
+@example(value=2**31)
+@example(value=-(2**31))
+@example(value=-(2**31) - 1)
+def test_sat32_keeps_what_fits_and_clips_the_rest(sat32, value):
+    assert sat32(value) == min(max(value, -(2**31)), 2**31 - 1)
+
+
+@FAL_1_2
+@given(e=INT32, delta=POSITIVE32)
+@example(e=-(2**31), delta=1)
+@example(e=-(2**31), delta=2**31 - 1)
+def test_fal_1_2_is_linear_up_to_delta_and_a_root_beyond(fal_1_2, e, delta):
+    magnitude = abs(e) if abs(e) <= delta else math.isqrt(abs(e) * delta)
+    assert fal_1_2(e, delta) == int(math.copysign(magnitude, e))
+
+
+@FAL_3_4
+@given(e=INT32, delta=POSITIVE32)
+def test_fal_3_4_is_within_its_roots_rounding(fal_3_4, e, delta):
+    result = fal_3_4(e, delta)
+    if abs(e) <= delta:
+        assert result == e
+        return
+    exact = delta * (abs(e) / delta) ** 0.75
+    assert result * e > 0
+    # the inner root is at least delta and may be 1 too low, the outer one again
+    assert exact * (1 - 0.5 / delta) - 1 - 1e-6 * exact <= abs(result) <= exact * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("delta", [1, 7, 214748, 2**31 - 2])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_fal_is_continuous_at_delta(delta, sign):
+    for function in (narrow(MODULES["fal"].fal_1_2), narrow(MODULES["fal"].fal_3_4)):
+        assert function(sign * delta, delta) == sign * delta
+        assert 0 <= sign * function(sign * (delta + 1), delta) - delta <= 1
+
+
+@FAL_1_2
+@pytest.mark.parametrize("e_m", [1.01e-4, 5e-4, 0.01, 0.3])
+def test_chained_halves_make_the_observers_exponents(fal_1_2, e_m):
+    delta_m = 1e-4
+    delta, e = round(delta_m * 2**31), round(e_m * 2**31)
+    quarter = fal_1_2(fal_1_2(e, delta), delta)
+    eighth = fal_1_2(quarter, delta)
+    assert quarter / 2**31 == pytest.approx(delta_m * (e_m / delta_m) ** (1 / 4), rel=2e-5)
+    assert eighth / 2**31 == pytest.approx(delta_m * (e_m / delta_m) ** (1 / 8), rel=2e-5)
+
+
+def fhan_in_floats(x1, x2, r, h):
+    """Eq. 19."""
+    d = r * h * h
+    a0 = h * x2
+    y = x1 + a0
+    a = a0 + y if abs(y) <= d else a0 + math.copysign((math.sqrt(d * (d + 8 * abs(y))) - d) / 2, y)
+    return -r * a / d if abs(a) <= d else -math.copysign(r, a)
+
+
+@FHAN
+@given(x1_m=st.floats(-0.9, 0.9), x2_m_s=st.floats(-0.5, 0.5))
+@example(x1_m=1e-7, x2_m_s=0.0)
+@example(x1_m=25 * 0.005**2, x2_m_s=0.0)
+def test_fhan_follows_eq_19(fhan, x1_m, x2_m_s):
+    r, h = 25.0, 5e-3
+    x1, a0 = round(x1_m * 2**34), round(h * x2_m_s * 2**34)
+    acceleration = fhan(x1, a0, round(r * 1e-6 * 2**40), round(r * h * h * 2**34))
+    # one LSB of a is r / d = 2.3e-6 m/s^2
+    assert acceleration / 2**40 / 1e-6 == pytest.approx(fhan_in_floats(x1_m, x2_m_s, r, h), abs=2e-5)
+
+
+@FHAN
+def test_fhan_without_a_divisor_commands_nothing(fhan):
+    assert fhan(1000, 0, 5, 0) == 0
+
+
+@pytest.mark.parametrize(
+    ("convert", "count", "value", "lsb"),
+    [
+        (units.metres_from_setpoint, 4_000_000, 0.4, 2**-31),
+        (units.metres_from_position, 400_000, 0.4, 2**-31),
+        (units.speed_from_velocity, 12_000, 100 * math.pi, 2**-20),
+        (units.velocity_from_speed, round(100 * math.pi * 2**20), 3000.0, 0.25),
+    ],
+)
+def test_unit_conversions_are_right_to_half_an_lsb(convert, count, value, lsb):
+    assert abs(convert(count) * lsb - value) <= 0.5 * lsb
+    assert abs(convert(-count) * lsb + value) <= 0.5 * lsb
+
+
+def test_quantised_velocities_survive_the_round_trip():
+    for velocity in range(-12_000, 12_001):
+        assert units.velocity_from_speed(units.speed_from_velocity(velocity)) == velocity
