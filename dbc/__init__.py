@@ -1,1 +1,1 @@
-""""""
+"""The contract on the bus: frames, codecs, end-to-end protection. Imports nothing of ours."""

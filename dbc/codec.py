@@ -4,6 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, ParamSpec, TypeVar
 
+from dbc.e2e import Checker, Protector
+from dbc.frame import Frame
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -65,6 +68,23 @@ class MessageCodec(Generic[P, T]):
     signals: Mapping[str, Signal]
     pack: Callable[P, int]
     unpack: Callable[[int], T]
+
+    def frame(self, data: int) -> Frame:
+        """Return the frame that carries a payload."""
+        return Frame(self.can_id, self.dlc, data)
+
+    def protector(self) -> Protector:
+        """Return a sender's E2E state for this (protected) message."""
+        return Protector(self._protected_ids(), self.dlc)
+
+    def checker(self) -> Checker:
+        """Return a receiver's E2E state for this (protected) message."""
+        return Checker(self._protected_ids(), self.dlc)
+
+    def _protected_ids(self) -> tuple[int, ...]:
+        if self.data_ids is None:
+            raise ValueError(f"message {self.name} is not E2E protected")
+        return self.data_ids
 
 
 @dataclass(frozen=True, slots=True)

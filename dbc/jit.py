@@ -19,7 +19,7 @@ def source_digest(*modules: str) -> str:
         origin = Path(spec.origin)
         files = sorted(origin.parent.rglob("*.py")) if spec.submodule_search_locations else [origin]
         for file in files:
-            digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+            digest.update(str(file.relative_to(origin.parent)).encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()
 
 
@@ -38,7 +38,7 @@ def njit(signature: str, *, depends: tuple[str, ...] = ()) -> Callable[[Callable
     """
 
     def compile_function(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(error_model="numpy")(function)
+        dispatcher: Any = numba.njit(error_model="numpy")(function)
         dispatcher.enable_caching()
         # private, but stable since numba 0.20; tests/dbc/test_jit.py fails if it stops working
         dispatcher._cache._cache_file._source_stamp = source_digest(function.__module__, *depends)

@@ -6,6 +6,7 @@ them in.
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Annotated, NamedTuple
 
 
@@ -125,6 +126,15 @@ class ObserverState(NamedTuple):
         Raw(32, signed=True, factor=2.0**-40 * 1e6, signal="EsoAcceleration", page=5),
         Raw(32, signed=True, factor=2.0**-42 * 1e9, signal="EsoDisturbance", page=6),
     ]
+
+
+class BenchCommand(IntEnum):
+    """What a BenchControl asks for."""
+
+    NONE = 0
+    RESET = 1
+    SET_FAULT = 2
+    SCALE_PARAMETER = 3
 
 
 class BenchControl(NamedTuple):

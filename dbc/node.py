@@ -27,25 +27,26 @@ NOTHING = Actions()
 
 
 class Node(Protocol):
-    """A participant that knows nothing of clocks, sockets or processes (sans-IO).
+    """A participant that knows nothing of clocks, sockets or processes (sans-IO)."""
 
-    Attributes
-    ----------
-    name : str
-        Unique on a bus.
-    accepts : frozenset of int or None
-        Acceptance filter over `Frame.can_id`; None accepts every frame.
-    latched : frozenset of int
-        Accepted ids whose `on_frame` only stores the frame and returns `NOTHING`: in lock-step they travel
-        with the next wake-up.
-    transmits : frozenset of int
-        Ids this node is the only sender of.
-    """
+    @property
+    def name(self) -> str:
+        """Unique on a bus."""
 
-    name: str
-    accepts: frozenset[int] | None
-    latched: frozenset[int]
-    transmits: frozenset[int]
+    @property
+    def accepts(self) -> frozenset[int] | None:
+        """Acceptance filter over `Frame.can_id`; None accepts every frame."""
+
+    @property
+    def latched(self) -> frozenset[int]:
+        """Accepted ids whose `on_frame` only stores the frame and returns `NOTHING`.
+
+        In lock-step they travel with the next wake-up.
+        """
+
+    @property
+    def transmits(self) -> frozenset[int]:
+        """Ids this node is the only sender of."""
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on or reset."""

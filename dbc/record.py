@@ -1,6 +1,7 @@
 """What a node writes down of itself, one row per period, for the bench to merge by time."""
 
 from array import array
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,15 @@ class Record:
 
     def __init__(self, columns: tuple[str, ...], typecode: str) -> None:
         self.columns = columns
-        self._cells = array(typecode)
-        self.append = self._cells.extend
+        self._cells: array[Any] = array(typecode)
+        self.append: Callable[[tuple[float, ...]], None] = self._cells.extend
 
     def columns_by_name(self) -> dict[str, np.ndarray]:
         """Return each column as an array of the number of rows."""
         table = np.array(self._cells).reshape(-1, len(self.columns))
         return dict(zip(self.columns, table.T, strict=True))
 
-    def save(self, path: Path, **extra: Any) -> None:
-        """Write the columns, and `extra` scalars, to an `.npz` file."""
-        np.savez(path, **self.columns_by_name(), **extra)
+    def save(self, path: Path) -> None:
+        """Write the columns to an `.npz` file."""
+        columns: dict[str, Any] = self.columns_by_name()
+        np.savez(path, **columns)

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
-from dbc.contract import MessageCodec
-from dbc.e2e import ACCEPTED, Checker, Status
+from dbc.codec import MessageCodec
+from dbc.e2e import ACCEPTED, Status
 from dbc.frame import Frame
 from dbc.node import PERIOD_NS
 
@@ -34,6 +34,8 @@ class Mailbox:
         Whether the last intact frame was not plausible.
     overruns : int
         Frames overwritten before they were read.
+    stale : bool
+        Whether valid data have been missing for `STALE_CYCLES`.
     """
 
     __slots__ = (
@@ -42,20 +44,23 @@ class Mailbox:
         "_cycle_periods",
         "_dlc",
         "_frame",
+        "_plausible",
         "_stale_periods",
         "_unpack",
-        "_plausible",
         "corrupt",
         "invalid",
         "is_new",
         "overruns",
+        "stale",
         "value",
     )
 
-    def __init__(self, message: MessageCodec, plausible: Callable[[Any], bool] = lambda value: True) -> None:
+    def __init__(
+        self, message: MessageCodec[..., Any], plausible: Callable[[Any], bool] = lambda value: True
+    ) -> None:
         self._unpack = message.unpack
         self._dlc = message.dlc
-        self._check = Checker(message.data_ids, message.dlc).check
+        self._check = message.checker().check
         self._cycle_periods = max(message.cycle_time_ns // PERIOD_NS, 1)
         self._stale_periods = STALE_CYCLES * self._cycle_periods
         self._age_periods = self._stale_periods
@@ -66,11 +71,7 @@ class Mailbox:
         self.corrupt = False
         self.invalid = False
         self.overruns = 0
-
-    @property
-    def stale(self) -> bool:
-        """Whether valid data have been missing too long."""
-        return self._age_periods >= self._stale_periods
+        self.stale = True
 
     def receive(self, frame: Frame) -> None:
         """Store a frame (receive interrupt)."""
@@ -83,17 +84,20 @@ class Mailbox:
         frame, self._frame = self._frame, None
         self.is_new = False
         self._age_periods += 1
+        self.stale = self._age_periods >= self._stale_periods
         if frame is None:
             if self._age_periods % self._cycle_periods == 0:
                 self._check(None)
             return
         status = self._check(frame.data) if frame.dlc == self._dlc else Status.WRONGCRC
-        self.corrupt = status not in ACCEPTED and status is not Status.INITIAL
         if status not in ACCEPTED:
+            self.corrupt = status != Status.INITIAL
             return
+        self.corrupt = False
         value = self._unpack(frame.data)
         self.invalid = not self._plausible(value)
         if not self.invalid:
             self.value = value
             self.is_new = True
             self._age_periods = 0
+            self.stale = False

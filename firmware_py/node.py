@@ -5,8 +5,8 @@ from enum import IntFlag
 import numpy as np
 
 from dbc.contract import Contract
-from dbc.e2e import Protector
 from dbc.frame import Frame
+from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from firmware_py.calibration import Calibration, CalibrationError
@@ -29,8 +29,6 @@ EXECUTION_NS = 100_000
 
 PHASE_NS = 500_000
 """How long after the sensor's sampling instant the controller's timer fires, ns."""
-
-BENCH_RESET = 1
 
 _EXECUTION_TIME_RAW = EXECUTION_NS * 200 // PERIOD_NS
 _STATUS_PERIODS = 100
@@ -149,7 +147,7 @@ class Controller:
             contract.controller_command.can_id: self._command,
             contract.drive_status.can_id: self._drive_status,
         }
-        self._protect = Protector(contract.drive_command.data_ids, contract.drive_command.dlc).protect
+        self._protect = contract.drive_command.protector().protect
         self._bench_reset = False
         self._state: int = State.POWER_ON
         self._faults = 0
@@ -174,7 +172,7 @@ class Controller:
         if mailbox is not None:
             mailbox.receive(frame)
         else:
-            self._bench_reset |= self._contract.bench_control.unpack(frame.data).command == BENCH_RESET
+            self._bench_reset |= self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET
         return NOTHING
 
     def on_timer(self, now_ns: int) -> Actions:
@@ -190,7 +188,7 @@ class Controller:
         drive_command = self._contract.drive_command
         payload = self._protect(drive_command.pack(self._controlword(conditions), velocity))
         send_ns = now_ns + EXECUTION_NS
-        sends = [(send_ns, Frame(drive_command.can_id, drive_command.dlc, payload))]
+        sends = [(send_ns, drive_command.frame(payload))]
         if self._cycle % _STATUS_PERIODS == 0:
             sends.append((send_ns, self._status_frame()))
         if self._cycle % _OBSERVER_PERIODS == _OBSERVER_PHASE:
@@ -275,27 +273,36 @@ class Controller:
     def _status_frame(self) -> Frame:
         status = self._contract.controller_status
         overruns = sum(mailbox.overruns for mailbox in self._mailboxes.values())
+        flags = {str(fault.name).lower(): int(bool(self._faults & fault)) for fault in Fault}
         payload = status.pack(
-            self._state,
-            int(self._io[k.IO_LAW]),
-            *((self._faults >> bit) & 1 for bit in range(len(Fault))),
-            _EXECUTION_TIME_RAW,
-            self._saturations,
-            min(overruns, _COUNT_MAX),
+            state=self._state,
+            control_law=int(self._io[k.IO_LAW]),
+            execution_time=_EXECUTION_TIME_RAW,
+            saturations=self._saturations,
+            mailbox_overruns=min(overruns, _COUNT_MAX),
+            **flags,
         )
-        return Frame(status.can_id, status.dlc, payload)
+        return status.frame(payload)
 
     def _observer_frame(self) -> Frame:
         observer = self._contract.observer_state
         page = self._cycle // _OBSERVER_PERIODS % _OBSERVER_PAGES
         value = int(self._kernel_state[k.ST_V1 + page])
-        return Frame(observer.can_id, observer.dlc, observer.pack(page, self._cycle & 0xFFFF, value))
+        return observer.frame(observer.pack(page, self._cycle & 0xFFFF, value))
 
     def _write_record(self, now_ns: int, velocity: int) -> None:
-        internals = self._kernel_state[k.ST_V1 : k.ST_Z4 + 1].tolist()
-        setpoint, position, flags = self._io[[k.IO_SETPOINT, k.IO_POSITION, k.IO_FLAGS]].tolist()
+        io = self._io.tolist()
         self.record.append(
-            (now_ns, self._state, self._faults, setpoint, position, velocity, flags, *internals)
+            (
+                now_ns,
+                self._state,
+                self._faults,
+                io[k.IO_SETPOINT],
+                io[k.IO_POSITION],
+                velocity,
+                io[k.IO_FLAGS],
+                *self._kernel_state.tolist()[k.ST_V1 : k.ST_Z4 + 1],
+            )
         )
 
 

@@ -1,1 +1,1 @@
-""""""
+"""The bench: bus, runs, scenarios, measurements, reports."""

@@ -48,30 +48,46 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="hil", description="Bench for an integer controller of a hydraulic crane over CAN.")
+    parser = argparse.ArgumentParser(
+        prog="hil", description="Bench for an integer controller of a hydraulic crane over CAN."
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    run = commands.add_parser("run", help="play a scenario", epilog=EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    run = commands.add_parser(
+        "run", help="play a scenario", epilog=EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     run.set_defaults(command=_run)
     run.add_argument("scenario", help="name (see `hil list`) or .toml file")
     run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
     run.add_argument("--mode", choices=MODES, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
-    run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log format: .log .asc .blf .trc ...")
+    run.add_argument(
+        "--log", default=".log", metavar="SUFFIX", help="bus log format: .log .asc .blf .trc ..."
+    )
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
-    run.add_argument("--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)")
+    run.add_argument(
+        "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
+    )
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)")
     run.add_argument("-i", "--interface", help="realtime: python-can interface (default: a hub of its own)")
     run.add_argument("-c", "--channel", help="realtime: its channel; lockstep: name that listeners attach to")
-    run.add_argument("--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower")
-    run.add_argument("--start-timeout", type=_seconds, default=120.0, metavar="S", help="for processes to start")
-    run.add_argument("--answer-timeout", type=_seconds, default=10.0, metavar="S", help="for a node to answer")
+    run.add_argument(
+        "--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower"
+    )
+    run.add_argument(
+        "--start-timeout", type=_seconds, default=120.0, metavar="S", help="for processes to start"
+    )
+    run.add_argument(
+        "--answer-timeout", type=_seconds, default=10.0, metavar="S", help="for a node to answer"
+    )
 
     bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
     bus.set_defaults(command=_bus)
     bus.add_argument("--channel", required=True, help="name to attach to: -i hilbus -c NAME")
-    bus.add_argument("--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)")
+    bus.add_argument(
+        "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
+    )
     bus.add_argument("--parent", type=int, help=argparse.SUPPRESS)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
@@ -133,12 +149,19 @@ def _run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}"), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[at]}"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"{name}: starting", total=duration_s, at="")
 
         def advance(simulated_s: float) -> None:
-            bar.update(task, completed=simulated_s, description=name, at=f"{simulated_s:.1f} of {duration_s:g} s")
+            bar.update(
+                task, completed=simulated_s, description=name, at=f"{simulated_s:.1f} of {duration_s:g} s"
+            )
 
         yield advance
 
@@ -180,7 +203,9 @@ def _bus(arguments: argparse.Namespace) -> int:
         return not (orphaned or stopped.is_set())
 
     with Hub(Wire(arguments.bitrate), arguments.channel, virtual=False) as hub:
-        print(f"hilbus channel {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True)
+        print(
+            f"hilbus channel {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True
+        )
         hub.run_in_wall_time(keep_running)
         if hub.dropped:
             print(f"hil: {hub.dropped} frames were dropped for slow listeners", file=sys.stderr)

@@ -99,7 +99,9 @@ def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str
         "ending": recording.ending,
         "rms_mm": rms_mm,
         "max_mm": max_mm,
-        "chatter_rpm_per_period": _finite(np.sqrt(np.nanmean(np.diff(speed_rpm) ** 2))) if len(speed_rpm) > 1 else None,
+        "chatter_rpm_per_period": _finite(np.sqrt(np.nanmean(np.diff(speed_rpm) ** 2)))
+        if len(speed_rpm) > 1
+        else None,
         "limits": limits,
         "within_limits": within,
         "paper": scenario.paper.get(options.controller),
@@ -119,7 +121,9 @@ def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str
 
 def frame_lengths(traffic: np.ndarray) -> np.ndarray:
     """Return each frame's length in bits, interframe space included."""
-    return np.array([classic_bits(can_id, dlc, data) for _, can_id, dlc, data in traffic.tolist()], dtype=np.int64)
+    return np.array(
+        [classic_bits(can_id, dlc, data) for _, can_id, dlc, data in traffic.tolist()], dtype=np.int64
+    )
 
 
 def bus_load_percent(recording: Recording, bits: np.ndarray, contract: Contract, bit_rate: int) -> float:

@@ -62,7 +62,9 @@ class OutputDirectory:
         if len(trace["time_s"]):
             made.append(self.scratch / "trace.csv")
             header = ",".join(trace)
-            np.savetxt(made[-1], np.column_stack(list(trace.values())), "%.10g", ",", header=header, comments="")
+            np.savetxt(
+                made[-1], np.column_stack(list(trace.values())), "%.10g", ",", header=header, comments=""
+            )
         if "error_m" in trace and len(trace["time_s"]) > 1:
             made.append(self.scratch / "picture.png")
             draw(made[-1], result, trace)
@@ -90,7 +92,8 @@ def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
     position, error, disturbance = axes
     paper = result["paper"]
     beside = f"   (paper: {paper['rms_mm']:.3f} / {paper['max_mm']:.3f} mm)" if paper else ""
-    title = f"{result['scenario']}, {result['controller'].upper()}, int32 over CAN at {result['bit_rate'] / 1e3:g} kbit/s"
+    bit_rate = f"{result['bit_rate'] / 1e3:g} kbit/s"
+    title = f"{result['scenario']}, {result['controller'].upper()}, int32 over CAN at {bit_rate}"
     figure.suptitle(f"{title}\nRMS {result['rms_mm']:.3f} mm, maximum {result['max_mm']:.3f} mm{beside}")
 
     position.plot(time_s, trace["reference_m"] * M_TO_MM, color=GREY, lw=3, label="reference")
@@ -99,10 +102,14 @@ def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
     error.plot(time_s, trace["error_m"] * M_TO_MM, color=RED, lw=0.9, label="reference - position")
     error.set_ylabel("error / mm")
     if result["controller"] == "adrc" and "eso_disturbance_m_s3" in trace:
-        disturbance.plot(time_s, trace["eso_disturbance_m_s3"], color=ORANGE, lw=0.9, label="observed by the ESO, z4")
+        disturbance.plot(
+            time_s, trace["eso_disturbance_m_s3"], color=ORANGE, lw=0.9, label="observed by the ESO, z4"
+        )
         disturbance.set_ylabel("total disturbance / (m/s³)")
     elif "target_velocity_rpm" in trace:
-        disturbance.plot(time_s, trace["target_velocity_rpm"], color=ORANGE, lw=0.9, label="commanded motor speed")
+        disturbance.plot(
+            time_s, trace["target_velocity_rpm"], color=ORANGE, lw=0.9, label="commanded motor speed"
+        )
         disturbance.set_ylabel("speed / rpm")
     disturbance.set_xlabel("time / s")
     for axis in axes:

@@ -109,7 +109,9 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
         allowed = ", ".join(sorted(required | optional))
         raise ScenarioError(f"{name}: unknown key {unknown[0]!r}; allowed are {allowed}")
     if content["reference"] not in REFERENCES:
-        raise ScenarioError(f"{name}: reference {content['reference']!r} is not one of {', '.join(REFERENCES)}")
+        raise ScenarioError(
+            f"{name}: reference {content['reference']!r} is not one of {', '.join(REFERENCES)}"
+        )
     duration_s = content["duration_s"]
     if not isinstance(duration_s, int | float) or not PERIOD_S <= duration_s <= 3600:
         raise ScenarioError(f"{name}: duration_s is {duration_s!r}, must be from {PERIOD_S} to 3600 s")
@@ -121,7 +123,8 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
         for controller, figures in content.get(key, {}).items():
             if controller not in CONTROLLERS or set(figures) != {"rms_mm", "max_mm"}:
                 raise ScenarioError(
-                    f"{name}: {key}.{controller} must be one of {', '.join(CONTROLLERS)} with rms_mm and max_mm"
+                    f"{name}: {key}.{controller} must be one of {', '.join(CONTROLLERS)} "
+                    "with rms_mm and max_mm"
                 )
     return Scenario(
         name=name,

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from dbc.contract import Contract
-from dbc.e2e import Protector
 from dbc.frame import Frame
+from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from hil.references import setpoint_counts
@@ -16,7 +16,6 @@ BRING_UP_PERIODS = 100
 _ENABLE_PERIOD = 20
 _COMMAND_PERIODS = 100
 _COMMAND_PHASE = 1  # not with the reset, which empties the receivers' mailboxes
-_RESET = 1
 
 
 class Supervisor:
@@ -46,8 +45,8 @@ class Supervisor:
         self._command = contract.controller_command
         self._bench_control = contract.bench_control
         self._bench_load = contract.bench_load
-        self._protect_setpoint = Protector(self._setpoint.data_ids, self._setpoint.dlc).protect
-        self._protect_command = Protector(self._command.data_ids, self._command.dlc).protect
+        self._protect_setpoint = self._setpoint.protector().protect
+        self._protect_command = self._command.protector().protect
         self._load_n = 0
         self._origin_ns = 0
         self._next_period = 0
@@ -74,7 +73,7 @@ class Supervisor:
         period = (now_ns - self._origin_ns) // PERIOD_NS
         k = period - BRING_UP_PERIODS
         raw = self._setpoints[min(max(k, 0), len(self._setpoints) - 1)]
-        frames = [Frame(self._setpoint.can_id, self._setpoint.dlc, self._protect_setpoint(self._setpoint.pack(raw)))]
+        frames = [self._setpoint.frame(self._protect_setpoint(self._setpoint.pack(raw)))]
         if period == 0:
             frames.append(self._reset_frame())
             frames.append(self._load_frame())
@@ -95,12 +94,12 @@ class Supervisor:
     def _command_frame(self, enable: bool) -> Frame:
         message = self._command
         payload = self._protect_command(message.pack(int(enable), self._law, 0))
-        return Frame(message.can_id, message.dlc, payload)
+        return message.frame(payload)
 
     def _reset_frame(self) -> Frame:
         message = self._bench_control
-        return Frame(message.can_id, message.dlc, message.pack(_RESET, 0, self._setpoints[0]))
+        return message.frame(message.pack(BenchCommand.RESET, 0, self._setpoints[0]))
 
     def _load_frame(self) -> Frame:
         message = self._bench_load
-        return Frame(message.can_id, message.dlc, message.pack(self._load_n))
+        return message.frame(message.pack(self._load_n))

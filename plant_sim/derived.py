@@ -44,8 +44,9 @@ def gravity_force_n(parameters: PlantParameters, position_m: float) -> float:
 def oil_stiffness_n_per_m(parameters: PlantParameters, position_m: float) -> tuple[float, float]:
     """Stiffness A²β/V of the closed chambers A and B."""
     volume_a, volume_b = chamber_volumes(position_m, parameters.vector())
-    beta = parameters.bulk_modulus_pa
-    return beta * parameters.piston_area_m2**2 / volume_a, beta * parameters.annulus_area_m2**2 / volume_b
+    stiffness_a = parameters.bulk_modulus_pa * parameters.piston_area_m2**2 / volume_a
+    stiffness_b = parameters.bulk_modulus_pa * parameters.annulus_area_m2**2 / volume_b
+    return float(stiffness_a), float(stiffness_b)
 
 
 def hydraulic_mode(parameters: PlantParameters, position_m: float) -> HydraulicMode:

@@ -42,12 +42,13 @@ def initial_state(parameters: PlantParameters, position_m: float = 0.0) -> np.nd
     state = np.zeros(at.STATE_SIZE)
     precharge = parameters.accumulator_precharge_pa
 
-    if position_m == 0.0:
-        inward = _inward_force(0.0, precharge, p)
-        if inward >= 0.0:
-            state[at.POSITION] = -inward / p[at.STOP_STIFFNESS]
-            state[at.PRESSURE_A] = state[at.PRESSURE_B] = precharge
-            return state
+    if position_m == 0.0 and _inward_force(0.0, precharge, p) >= 0.0:
+        x = 0.0
+        for _ in range(_PASSES):
+            x = -_inward_force(x, precharge, p) / p[at.STOP_STIFFNESS]
+        state[at.POSITION] = x
+        state[at.PRESSURE_A] = state[at.PRESSURE_B] = precharge
+        return state
 
     volume_a, volume_b = chamber_volumes(position_m, p)
     oil_volume = 0.0

@@ -182,9 +182,11 @@ def advance(
 
     Notes
     -----
-    A chamber's pressure ends a substep at the vapour pressure or above. The volume that would be missing
-    there comes out of the accumulator, as through a check valve without resistance: oil is conserved, but the
-    cavity refills faster than a real one, and there is no pressure spike from its collapse.
+    The check valves keep the nominal machine above the vapour pressure at any motor speed and loads of
+    ±20 kN. Where they do not (soft oil or a light load, reversed at resonance), a chamber's pressure is held
+    at the vapour pressure, and the volume that would be missing there comes out of the accumulator, as
+    through a check valve without resistance: oil is conserved, but the cavity refills faster than a real one,
+    and there is no pressure spike from its collapse.
     """
     y = (state[at.POSITION], state[at.VELOCITY], state[at.PRESSURE_A], state[at.PRESSURE_B])
     oil_volume = state[at.OIL_VOLUME]

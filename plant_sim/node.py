@@ -3,11 +3,11 @@
 import math
 
 from dbc.contract import Contract
-from dbc.e2e import ACCEPTED, Checker, Protector
+from dbc.e2e import ACCEPTED
 from dbc.frame import Frame
+from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
-from plant_sim import layout as at
 from plant_sim.drive import COUNTS_PER_RPM, Drive
 from plant_sim.equilibrium import initial_state
 from plant_sim.hydraulics import accumulator_pressure
@@ -16,7 +16,6 @@ from plant_sim.parameters import PlantParameters
 from plant_sim.sensors import PositionSensor, pressure_count
 
 SUBSTEPS = 10
-BENCH_RESET = 1
 
 _PERIOD_S = PERIOD_NS * 1e-9
 _STATUS_PERIODS = 10
@@ -30,8 +29,8 @@ _SENSOR_OK = 0
 class Plant:
     """Drive, sensors and plant on one 1 ms clock.
 
-    At each timer call the plant is brought up to now, the position is sampled and sent, and the drive takes the
-    newest DriveCommand and holds it for one period.
+    At each timer call the plant is brought up to now, the position is sampled and sent, and the drive takes
+    the newest DriveCommand and holds it for one period.
 
     Parameters
     ----------
@@ -56,6 +55,7 @@ class Plant:
         self._contract = contract
         self._parameters = parameters
         self._vector = parameters.vector()
+        self._vector_list: list[float] = self._vector.tolist()
         self._sensor = sensor or PositionSensor()
         self.accepts = frozenset(
             message.can_id
@@ -85,11 +85,13 @@ class Plant:
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: at rest, retracted, drive off."""
         contract = self._contract
-        self._check = Checker(contract.drive_command.data_ids, contract.drive_command.dlc).check
-        self._protect_position = _protector(contract.position_feedback)
-        self._protect_status = _protector(contract.drive_status)
+        self._check = contract.drive_command.checker().check
+        self._protect_position = contract.position_feedback.protector().protect
+        self._protect_status = contract.drive_status.protector().protect
         self._mailbox: dict[int, Frame] = {}
         self._time_ns = next_period(now_ns)
+        self._speed_command_rad_s = 0.0
+        self._load_n = 0.0
         self._restart(0.0)
         return Actions(self._time_ns)
 
@@ -107,11 +109,11 @@ class Plant:
             advance(state, self._vector, self._speed_command_rad_s, self._load_n, _PERIOD_S, SUBSTEPS)
             self._time_ns += PERIOD_NS
         position_m, velocity_m_s, pressure_a_pa, pressure_b_pa, speed_rad_s, oil_m3 = state.tolist()
-        accumulator_pa = accumulator_pressure(oil_m3, self._vector)
+        accumulator_pa = accumulator_pressure(oil_m3, self._vector_list)
 
         feedback = contract.position_feedback
         payload = self._protect_position(feedback.pack(_SENSOR_OK, self._sensor.read(position_m)))
-        sends = [(now_ns, Frame(feedback.can_id, feedback.dlc, payload))]
+        sends = [(now_ns, feedback.frame(payload))]
 
         self._speed_command_rad_s = self._drive.step(self._drive_command())
         phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
@@ -119,11 +121,11 @@ class Plant:
             status = contract.drive_status
             counts = round(speed_rad_s * _COUNTS_PER_RAD_S)
             payload = self._protect_status(status.pack(self._drive.statusword, counts))
-            sends.append((now_ns, Frame(status.can_id, status.dlc, payload)))
+            sends.append((now_ns, status.frame(payload)))
         elif phase == _PRESSURE_PHASE:
             pressure = contract.pressure_feedback
             counts3 = (pressure_count(pa) for pa in (pressure_a_pa, pressure_b_pa, accumulator_pa))
-            sends.append((now_ns, Frame(pressure.can_id, pressure.dlc, pressure.pack(*counts3))))
+            sends.append((now_ns, pressure.frame(pressure.pack(*counts3))))
         self.record.append(
             (
                 self._time_ns,
@@ -142,9 +144,7 @@ class Plant:
 
     def _restart(self, position_m: float) -> None:
         self._state = initial_state(self._parameters, position_m)
-        self._drive = Drive(
-            self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2
-        )
+        self._drive = Drive(self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2)
         self._speed_command_rad_s = 0.0
         self._load_n = 0.0
 
@@ -153,7 +153,7 @@ class Plant:
         frame = self._mailbox.pop(contract.bench_control.can_id, None)
         if frame is not None:
             control = contract.bench_control.unpack(frame.data)
-            if control.command == BENCH_RESET:
+            if control.command == BenchCommand.RESET:
                 self._restart(control.value * _RESET_LSB_M)
         frame = self._mailbox.pop(contract.bench_load.can_id, None)
         if frame is not None:
@@ -169,7 +169,3 @@ class Plant:
             return None
         command = message.unpack(frame.data)
         return command.controlword, command.target_velocity
-
-
-def _protector(message):
-    return Protector(message.data_ids, message.dlc).protect

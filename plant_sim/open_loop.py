@@ -64,8 +64,8 @@ def simulate(
     Examples
     --------
     >>> trace = simulate(np.full(1000, 100.0))
-    >>> 0.05 < trace.position_m[-1] < 0.07
-    True
+    >>> print(f"{trace.position_m[-1]:.3f} m")
+    0.059 m
     """
     speed = _finite_array("speed_command_rad_s", speed_command_rad_s)
     if speed.ndim != 1:

@@ -7,6 +7,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from dbc.frame import Frame
@@ -22,7 +23,7 @@ _MAX_MAIL = 1000
 _IDLE_POLL_S = 0.2
 
 
-class NodeGone(Exception):
+class NodeGoneError(Exception):
     """A node process ended, or did not answer in time."""
 
     def __init__(self, name: str, reason: str) -> None:
@@ -67,10 +68,8 @@ class RemoteNode:
 
     def stop(self) -> None:
         """Tell the process to write its record and end."""
-        try:
+        with suppress(OSError):  # it may have ended by itself
             self._link.send(link.pack_event(link.STOP, 0))
-        except OSError:
-            pass  # it has ended by itself
         self._link.close()
 
     def _exchange(self, kind: int, now_ns: int) -> Actions:
@@ -78,11 +77,11 @@ class RemoteNode:
             self._link.send(link.pack_event(kind, now_ns, self._mail))
             answer = self._link.recv(link.MAX_PACKET)
         except BlockingIOError:
-            raise NodeGone(self.name, f"did not answer for {self._timeout_s:g} s") from None
+            raise NodeGoneError(self.name, f"did not answer for {self._timeout_s:g} s") from None
         except OSError:
             answer = b""
         if not answer:
-            raise NodeGone(self.name, "ended")
+            raise NodeGoneError(self.name, "ended")
         self._mail.clear()
         self.exchanges += 1
         return link.unpack_actions(answer)

@@ -157,7 +157,9 @@ def receive_json(link: socket.socket) -> dict[str, Any]:
     return content
 
 
-def connect(channel: str, hello: dict[str, Any], timeout_s: float = 5.0) -> tuple[socket.socket, dict[str, Any]]:
+def connect(
+    channel: str, hello: dict[str, Any], timeout_s: float = 5.0
+) -> tuple[socket.socket, dict[str, Any]]:
     """Attach to a hub and return the link and the hub's answer.
 
     Raises

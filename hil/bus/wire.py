@@ -6,12 +6,11 @@ the order in which the nodes were attached.
 """
 
 from array import array
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 from dbc.frame import EFF_FLAG, Frame
-from dbc.node import Actions, Node
+from dbc.node import NOTHING, Actions, Node
 from hil.bus.wire_time import classic_bits
 
 NEVER = 1 << 62
@@ -29,10 +28,12 @@ class Clock:
     def local(self, bus_ns: int) -> int:
         """Return the node's time at bus time `bus_ns`, ns."""
         elapsed_ns = bus_ns - self.phase_ns
-        return elapsed_ns + elapsed_ns * self.drift_ppb // _NS_PER_S
+        return elapsed_ns + (elapsed_ns * self.drift_ppb // _NS_PER_S if self.drift_ppb else 0)
 
     def bus(self, local_ns: int) -> int:
         """Return the first bus time at which the node's clock shows `local_ns` or later, ns."""
+        if not self.drift_ppb:
+            return self.phase_ns + local_ns
         return self.phase_ns - (-local_ns * _NS_PER_S // (_NS_PER_S + self.drift_ppb))
 
 
@@ -83,11 +84,11 @@ class Wire:
         self.now_ns = 0
         self.traffic = Traffic()
         self.busy_ns = 0
-        self.listeners: list[Callable[[int, Frame], None]] = []
         self._out_of_band = out_of_band
         self._ports: list[Port] = []
         self._wakes: list[int] = []
         self._routes: dict[int, list[Port]] = {}
+        self._keys: dict[int, int] = {}
         self._released: list[tuple[int, int, Port, Frame]] = []
         self._pending: list[tuple[int, int, int, Port, Frame]] = []
         self._sequence = 0
@@ -116,67 +117,73 @@ class Wire:
         port.connected = False
         self._wakes[port.order] = NEVER
         self._routes.clear()
-        self._released = sorted(entry for entry in self._released if entry[2] is not port)
-        self._pending = sorted(entry for entry in self._pending if entry[3] is not port)
+        self._released[:] = sorted(entry for entry in self._released if entry[2] is not port)
+        self._pending[:] = sorted(entry for entry in self._pending if entry[3] is not port)
 
     def start(self, port: Port) -> None:
         """Power a node on now."""
         self._apply(port, port.node.on_start(port.clock.local(self.now_ns)))
 
     def send(self, port: Port, ready_ns: int, frame: Frame) -> None:
-        """Hand a frame to the port's CAN controller at bus time `ready_ns`."""
+        """Hand a frame to the port's CAN controller at bus time `ready_ns`, now or later."""
         self._sequence += 1
-        heappush(self._released, (ready_ns, self._sequence, port, frame))
+        if ready_ns > self.now_ns or frame.can_id in self._out_of_band:
+            heappush(self._released, (max(ready_ns, self.now_ns), self._sequence, port, frame))
+        else:
+            self._queue(port, self._sequence, frame)
 
     def next_event_ns(self) -> int:
         """Return the bus time of the next event, `NEVER` if there is none."""
-        return min(self._end_ns, min(self._wakes, default=NEVER), self._release_ns(), self._arbitration_ns())
+        arbitration_ns = max(self._idle_ns, self.now_ns) if self._pending and self._on_wire is None else NEVER
+        release_ns = self._released[0][0] if self._released else NEVER
+        return min(self._end_ns, min(self._wakes, default=NEVER), release_ns, arbitration_ns)
 
     def run(self, until_ns: int) -> None:
         """Process every event before bus time `until_ns`."""
-        wakes = self._wakes
+        wakes, released, pending = self._wakes, self._released, self._pending
         while True:
-            end_ns, wake_ns = self._end_ns, min(wakes, default=NEVER)
-            release_ns, arbitration_ns = self._release_ns(), self._arbitration_ns()
-            event_ns = min(end_ns, wake_ns, release_ns, arbitration_ns)
+            event_ns, step = self._end_ns, self._finish_frame
+            wake_ns = min(wakes, default=NEVER)
+            if wake_ns < event_ns:
+                event_ns, step = wake_ns, self._wake
+            if released and released[0][0] < event_ns:
+                event_ns, step = released[0][0], self._release
+            if pending and self._on_wire is None:
+                arbitration_ns = max(self._idle_ns, self.now_ns)
+                if arbitration_ns < event_ns:
+                    event_ns, step = arbitration_ns, self._arbitrate
             if event_ns >= until_ns:
                 break
             self.now_ns = event_ns
-            if end_ns == event_ns:
-                self._finish_frame()
-            elif wake_ns == event_ns:
-                self._wake(self._ports[wakes.index(wake_ns)])
-            elif release_ns == event_ns:
-                self._release()
-            else:
-                self._arbitrate()
+            step()
         self.now_ns = max(self.now_ns, until_ns)
 
-    def _release_ns(self) -> int:
-        return self._released[0][0] if self._released else NEVER
-
-    def _arbitration_ns(self) -> int:
-        if self._on_wire is not None or not self._pending:
-            return NEVER
-        return max(self._idle_ns, self.now_ns)
-
-    def _wake(self, port: Port) -> None:
+    def _wake(self) -> None:
+        port = self._ports[self._wakes.index(self.now_ns)]
         self._wakes[port.order] = NEVER
         self._apply(port, port.node.on_timer(port.clock.local(self.now_ns)))
 
     def _apply(self, port: Port, actions: Actions) -> None:
         wake_ns, sends = actions
+        to_bus = port.clock.bus
         if wake_ns is not None:
-            self._wakes[port.order] = max(port.clock.bus(wake_ns), self.now_ns)
+            self._wakes[port.order] = max(to_bus(wake_ns), self.now_ns)
         for send_ns, frame in sends:
-            self.send(port, max(port.clock.bus(send_ns), self.now_ns), frame)
+            self.send(port, to_bus(send_ns), frame)
 
     def _release(self) -> None:
         _, sequence, port, frame = heappop(self._released)
         if frame.can_id in self._out_of_band:
             self._deliver(port, frame)
         else:
-            heappush(self._pending, (arbitration_key(frame.can_id), port.order, sequence, port, frame))
+            self._queue(port, sequence, frame)
+
+    def _queue(self, port: Port, sequence: int, frame: Frame) -> None:
+        can_id = frame.can_id
+        key = self._keys.get(can_id)
+        if key is None:
+            key = self._keys[can_id] = arbitration_key(can_id)
+        heappush(self._pending, (key, port.order, sequence, port, frame))
 
     def _arbitrate(self) -> None:
         _, _, _, port, frame = heappop(self._pending)
@@ -194,20 +201,18 @@ class Wire:
         self._deliver(port, frame)
 
     def _deliver(self, sender: Port, frame: Frame) -> None:
-        self.traffic.cells.extend((self.now_ns, *frame))
-        for listener in self.listeners:
-            listener(self.now_ns, frame)
-        for port in self._receivers(frame.can_id):
+        now_ns = self.now_ns
+        self.traffic.cells.extend((now_ns, *frame))
+        for port in self._routes.get(frame.can_id) or self._route(frame.can_id):
             if port is not sender:
-                self._apply(port, port.node.on_frame(port.clock.local(self.now_ns), frame))
+                actions = port.node.on_frame(port.clock.local(now_ns), frame)
+                if actions is not NOTHING:
+                    self._apply(port, actions)
 
-    def _receivers(self, can_id: int) -> list[Port]:
-        route = self._routes.get(can_id)
-        if route is None:
-            route = [
-                port
-                for port in self._ports
-                if port.connected and (port.node.accepts is None or can_id in port.node.accepts)
-            ]
-            self._routes[can_id] = route
+    def _route(self, can_id: int) -> list[Port]:
+        route = self._routes[can_id] = [
+            port
+            for port in self._ports
+            if port.connected and (port.node.accepts is None or can_id in port.node.accepts)
+        ]
         return route

@@ -3,14 +3,14 @@
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from firmware_py.node import PHASE_NS
-from hil.bus.hub import Hub, NodeGone
+from hil.bus.hub import Hub, NodeGoneError
 from hil.bus.wire import Clock, Port, Wire
 from hil.run.inprocess import make_wire, play, traffic_of
 from hil.run.node_processes import NodeProcesses, load_record
@@ -54,13 +54,15 @@ def run_lockstep(options: RunOptions) -> Recording:
                 for port in ports.values():
                     wire.start(port)
                 ending = play(wire, supervisor, options, hub.service)
-            except NodeGone as error:
+            except NodeGoneError as error:
                 gone, gone_ns = error, wire.now_ns
                 _run_without(error, wire, ports)
             wall_s = time.perf_counter() - ready_s
         simulated_s = wire.now_ns / 1e9
-        notes = {
-            "exchanges_per_period": sum(node.exchanges for node in hub.nodes.values()) * PERIOD_NS / wire.now_ns,
+        notes: dict[str, object] = {
+            "exchanges_per_period": sum(node.exchanges for node in hub.nodes.values())
+            * PERIOD_NS
+            / wire.now_ns,
             "listener_drops": hub.dropped,
             "injected_frames": len(hub.injections),
         }
@@ -101,12 +103,12 @@ def _wait_for_nodes(hub: Hub, processes: NodeProcesses, options: RunOptions) -> 
         hub.service(_POLL_S)
 
 
-def _run_without(gone: NodeGone, wire: Wire, ports: dict[str, Port]) -> None:
+def _run_without(gone: NodeGoneError, wire: Wire, ports: dict[str, Port]) -> None:
     """Let the survivors go on for a while, so that their reaction is on record."""
     wire.detach(ports[gone.name])
     try:
         wire.run(wire.now_ns + AFTERMATH_NS)
-    except NodeGone as another:
+    except NodeGoneError as another:
         wire.detach(ports[another.name])
 
 
@@ -137,7 +139,5 @@ def _pinned_to_one_core(pids: list[int]) -> Iterator[None]:
 
 
 def _set_affinity(pid: int, cores: set[int]) -> None:
-    try:
+    with suppress(OSError):  # not permitted here, or the process has ended: only speed depends on it
         os.sched_setaffinity(pid, cores)
-    except OSError:
-        pass  # not permitted here, or the process has ended: only speed depends on it

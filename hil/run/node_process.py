@@ -29,17 +29,25 @@ EXIT_BROKEN = 3
 class RecordingNode(Node, Protocol):
     """A node that writes down what it saw of itself."""
 
-    record: Record
+    @property
+    def record(self) -> Record:
+        """Its rows."""
 
 
 def add_node_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that both sides share; -i, -c and -b are python-can's."""
-    parser.add_argument("-i", "--interface", help="python-can interface (default: python-can's configuration)")
+    parser.add_argument(
+        "-i", "--interface", help="python-can interface (default: python-can's configuration)"
+    )
     parser.add_argument("-c", "--channel", help="channel of the interface, e.g. vcan0 or a hilbus name")
     parser.add_argument("-b", "--bitrate", type=int, help="bit/s, for adapters that set it")
-    parser.add_argument("--rt-ratio", type=ratio, default=Fraction(1), metavar="R", help="node time per wall time")
+    parser.add_argument(
+        "--rt-ratio", type=ratio, default=Fraction(1), metavar="R", help="node time per wall time"
+    )
     parser.add_argument("--record", type=Path, metavar="DIR", help="write NAME.npz there at the end")
-    parser.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)")
+    parser.add_argument(
+        "--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)"
+    )
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
 
 
@@ -75,7 +83,7 @@ def node_main(
             if answer["virtual"]:
                 serve(node, connection, arguments.channel)
             else:
-                bus = HilBus(arguments.channel, greeted=(connection, answer))
+                bus: can.BusABC = HilBus(arguments.channel, greeted=(connection, answer))
                 _run_in_wall_time(node, bus, arguments, clock)
         else:
             given = {key: getattr(arguments, key) for key in ("interface", "channel", "bitrate")}
@@ -85,7 +93,12 @@ def node_main(
             node.record.save(arguments.record / f"{node.name}.npz")
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
-    except (ContractError, DuplicateNodeError, can.CanInitializationError, can.CanInterfaceNotImplementedError) as e:
+    except (
+        ContractError,
+        DuplicateNodeError,
+        can.CanInitializationError,
+        can.CanInterfaceNotImplementedError,
+    ) as e:
         return _complain(parser, e, EXIT_USAGE)
     except (LinkError, can.CanError, OSError) as error:
         return _complain(parser, error, EXIT_BROKEN)
@@ -107,7 +120,9 @@ def serve(node: Node, connection: socket.socket, channel: str) -> None:
             except OSError:
                 packet = b""
             if not packet:
-                raise LinkError(f"the hub of channel {channel!r} ended without a stop: is the bench still there?")
+                raise LinkError(
+                    f"the hub of channel {channel!r} ended without a stop: is the bench still there?"
+                )
             kind, now_ns, frames = link.unpack_event(packet)
             if kind == link.STOP:
                 return

@@ -94,4 +94,3 @@ class Recording:
     ending: str = ""
     broken: bool = False
     notes: dict[str, object] = field(default_factory=dict)
-

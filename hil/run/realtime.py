@@ -46,7 +46,12 @@ class Lateness:
         """Return the median, 99th percentile and maximum in µs, and the overruns."""
         late = np.array(self.timer_ns) if self.timer_ns else np.zeros(1)
         p50, p99 = np.percentile(late, [50, 99])
-        return {"p50_us": p50 / 1e3, "p99_us": p99 / 1e3, "max_us": late.max() / 1e3, "overruns": self.overruns}
+        return {
+            "p50_us": p50 / 1e3,
+            "p99_us": p99 / 1e3,
+            "max_us": late.max() / 1e3,
+            "overruns": self.overruns,
+        }
 
 
 class RealtimeNode:
@@ -87,7 +92,8 @@ class RealtimeNode:
             message = self._bus.recv(self._wall_s(wait_ns))
             if message is not None and self._is_ours(message):
                 raise DuplicateNodeError(
-                    f"{self._bus.channel_info} has a {self._node.name} already: stop it or choose another channel"
+                    f"{self._bus.channel_info} has a {self._node.name} already: "
+                    "stop it or choose another channel"
                 )
 
     def run(self, keep_running: Callable[[], bool]) -> None:
@@ -105,9 +111,7 @@ class RealtimeNode:
                 self._receive(message)
 
     def _now(self) -> int:
-        return self._clock.local(
-            time.monotonic_ns() * self._ratio.numerator // self._ratio.denominator
-        )
+        return self._clock.local(time.monotonic_ns() * self._ratio.numerator // self._ratio.denominator)
 
     def _wall_s(self, node_ns: int) -> float:
         return node_ns * self._ratio.denominator / self._ratio.numerator / 1e9

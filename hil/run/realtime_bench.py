@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import can
@@ -135,7 +135,7 @@ def _wait_for_both(
             waiting_for.pop(message.arbitration_id, None)
 
 
-def _until_done(supervisor: Supervisor, processes: NodeProcesses, options: RunOptions):
+def _until_done(supervisor: Supervisor, processes: NodeProcesses, options: RunOptions) -> Callable[[], bool]:
     next_check_s = 0.0
 
     def keep_running() -> bool:

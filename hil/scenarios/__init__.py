@@ -1,1 +1,1 @@
-""""""
+"""The built-in scenarios, as TOML."""

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from adrc_in_floats import FloatAdrc
 
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
@@ -119,12 +120,17 @@ def test_the_differentiator_leads_its_lag_away_on_a_ramp():
     assert v1 + 0.010 * v2 == pytest.approx(setpoint_m + 0.05e-3, abs=1e-7)
 
 
-def test_the_observers_model_terms_may_include_a2n():
-    plain, damped = Bench(Tuning()), Bench(Tuning(adrc=AdrcTuning(a2n_per_s=-20.0)))
-    for bench in (plain, damped):
-        for tick in range(50):
-            bench.step(0.1, 0.1 + 1e-6 * tick)
-    assert plain.state[k.ST_Z3] != damped.state[k.ST_Z3]
+@pytest.mark.parametrize("a2n_per_s", [0.0, -40.0, 40.0])
+def test_observer_and_command_follow_the_float_reference_also_with_a2n(a2n_per_s):
+    adrc = AdrcTuning(a2n_per_s=a2n_per_s)
+    bench, floats = Bench(Tuning(adrc=adrc)), FloatAdrc(adrc, 100_000)
+    for tick in range(30):
+        setpoint, position_um = 1_000_000 + 4 * tick**2, 100_000 + tick**2 // 3
+        command = bench.step(setpoint * 1e-7, position_um * 1e-6)
+        assert command == pytest.approx(floats.step(setpoint, position_um) * RAD_S_PER_COUNT, abs=0.06)
+    scales = (2.0**-31, 2.0**-38 / 1e-3, 2.0**-40 / 1e-6, 2.0**-42 / 1e-9)
+    observed = [bench.state[k.ST_Z1 + n] * scale for n, scale in enumerate(scales)]
+    assert observed == pytest.approx(floats.z, rel=1e-3)
 
 
 def test_an_unknown_law_commands_standstill():

@@ -1,7 +1,7 @@
-"""A second, independent implementation of the plant: its equations as printed, integrated by scipy's Radau.
+"""A second, independent implementation of the plant: its equations integrated by scipy's Radau.
 
-Nothing of plant_sim is used. The motor is integrated like any other state instead of solved exactly, volumes and
-geometry follow the state at every instant, and the sine and cosine of every angle are taken as such.
+Nothing of plant_sim is used. The motor is integrated like any other state instead of solved exactly, volumes
+and geometry follow the state at every instant, and the sine and cosine of every angle are taken as such.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ def derivative(y, command, load_force, machine):
     return [v, dv, dp_a, dp_b, d_omega, dv_oil]
 
 
-def integrate(state, commands, load_forces, machine=Machine(), dt=1e-3, rtol=1e-9):  # noqa: B008
+def integrate(state, commands, load_forces, machine=Machine(), dt=1e-3, rtol=1e-9):
     """Return the states at the start of each period and at the end of the last, shape (n + 1, 6)."""
     states = np.empty((len(commands) + 1, 6))
     states[0] = state
