@@ -9,7 +9,6 @@ import numpy as np
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from firmware_py.node import EXECUTION_NS, PHASE_NS
-from hil.bus.wire import INTERMISSION_BITS
 from hil.bus.wire_time import classic_bits
 from hil.run.options import Recording, RunOptions
 from hil.scenario import PERIOD_S, Scenario
@@ -90,7 +89,6 @@ def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str
     within = None
     if limits and complete and rms_mm is not None and max_mm is not None:
         within = rms_mm <= limits["rms_mm"] and max_mm <= limits["max_mm"]
-    bits = frame_lengths(recording.traffic)
     return {
         "scenario": scenario.name,
         "controller": options.controller,
@@ -106,8 +104,8 @@ def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str
         "within_limits": within,
         "paper": scenario.paper.get(options.controller),
         "bit_rate": options.bit_rate,
-        "bus_load_percent": bus_load_percent(recording, bits, contract, options.bit_rate),
-        "latency_us": latency_us(recording, bits, contract, options.bit_rate),
+        "bus_load_percent": bus_load_percent(recording, contract, options.bit_rate),
+        "latency_us": latency_us(recording, contract),
         "bus_frames": len(recording.traffic),
         "bus_sha256": hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest(),
         "scenario_start_bus_s": recording.start_ns / 1e9,
@@ -119,38 +117,28 @@ def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str
     }
 
 
-def frame_lengths(traffic: np.ndarray) -> np.ndarray:
-    """Return each frame's length in bits, interframe space included."""
-    return np.array(
-        [classic_bits(can_id, dlc, data) for _, can_id, dlc, data in traffic.tolist()], dtype=np.int64
-    )
+def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) -> float:
+    """Return the share of bus time that the frames take at `bit_rate`, the bench channel left out."""
+    bench = {message.can_id for message in contract.messages if message.bench_channel}
+    frames = recording.traffic.tolist()
+    bits = sum(classic_bits(can_id, dlc, data) for _, can_id, dlc, data in frames if can_id not in bench)
+    return 100.0 * bits / bit_rate / recording.simulated_s
 
 
-def bus_load_percent(recording: Recording, bits: np.ndarray, contract: Contract, bit_rate: int) -> float:
-    """Return the share of bus time in use, the bench channel left out."""
-    bench = [message.can_id for message in contract.messages if message.bench_channel]
-    counted = ~np.isin(recording.traffic[:, 1], np.array(bench, dtype=np.uint64))
-    return float(100.0 * bits[counted].sum() / bit_rate / recording.simulated_s)
-
-
-def latency_us(
-    recording: Recording, bits: np.ndarray, contract: Contract, bit_rate: int
-) -> dict[str, float] | None:
+def latency_us(recording: Recording, contract: Contract) -> dict[str, float] | None:
     """Return percentiles of the bus time from a feedback's end to the end of the command made from it, µs.
 
     A command belongs to the last controller period that began an execution time or more before the command
-    started on the bus, and was made from the newest PositionFeedback that had ended at that period's begin.
+    ended on the bus, and was made from the newest PositionFeedback that had ended at that period's begin.
     """
     traffic, controller = recording.traffic, recording.controller
     if controller is None:
         return None
     ends_ns = traffic[:, 0].astype(np.int64)
     feedback_ns = ends_ns[traffic[:, 1] == contract.position_feedback.can_id]
-    is_command = traffic[:, 1] == contract.drive_command.can_id
-    command_ns = ends_ns[is_command]
-    starts_ns = command_ns - (bits[is_command] - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
+    command_ns = ends_ns[traffic[:, 1] == contract.drive_command.can_id]
     timer_ns = controller["time_ns"] + PHASE_NS
-    period = np.searchsorted(timer_ns, starts_ns - EXECUTION_NS, side="right") - 1
+    period = np.searchsorted(timer_ns, command_ns - EXECUTION_NS, side="right") - 1
     newest = np.searchsorted(feedback_ns, timer_ns[period], side="right") - 1
     known = (period >= 0) & (newest >= 0)
     if not known.any():

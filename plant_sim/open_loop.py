@@ -65,7 +65,7 @@ def simulate(
     --------
     >>> trace = simulate(np.full(1000, 100.0))
     >>> print(f"{trace.position_m[-1]:.3f} m")
-    0.059 m
+    0.060 m
     """
     speed = _finite_array("speed_command_rad_s", speed_command_rad_s)
     if speed.ndim != 1:

@@ -161,6 +161,7 @@ class Hub:
         self._participants: dict[int, tuple[Port, Participant, socket.socket]] = {}
         self._strangers: dict[int, socket.socket] = {}
         self._names = 0
+        self._catch_up: Callable[[], None] = lambda: None
         self._selector = selectors.SelectSelector()
         self._path = link.socket_path(channel)
         self._listener = link.seqpacket_socket()
@@ -202,7 +203,9 @@ class Hub:
 
     def service(self, timeout_s: float = 0.0) -> None:
         """Greet who arrives, take what participants send, and pass on what they could not take before."""
-        for key, _ in self._selector.select(timeout_s):
+        ready = self._selector.select(timeout_s)
+        self._catch_up()
+        for key, _ in ready:
             if key.fileobj is self._listener:
                 self._accept()
             elif key.fd in self._strangers:
@@ -215,11 +218,11 @@ class Hub:
     def run_in_wall_time(self, keep_running: Callable[[], bool]) -> None:
         """Serve while `keep_running` says so, with bus time running as wall time does."""
         origin_ns = time.monotonic_ns()
+        self._catch_up = lambda: self.wire.run(time.monotonic_ns() - origin_ns)
         while keep_running():
-            now_ns = time.monotonic_ns() - origin_ns
-            self.wire.run(now_ns)
+            self._catch_up()
             next_ns = self.wire.next_event_ns()
-            wait_s = _IDLE_POLL_S if next_ns >= NEVER else (next_ns - now_ns) / 1e9
+            wait_s = _IDLE_POLL_S if next_ns >= NEVER else (next_ns - self.wire.now_ns) / 1e9
             self.service(min(max(wait_s, 0.0), _IDLE_POLL_S))
 
     def attach(self, name: str, clock: Clock | None = None) -> Port:

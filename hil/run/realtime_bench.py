@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 
 import can
 import numpy as np
@@ -40,10 +41,11 @@ def run_realtime(options: RunOptions) -> Recording:
         listener = _open(interface, channel)
         own = _open(interface, channel)
         with listener, own, NodeProcesses(options, interface, channel) as processes:
-            heard: list[can.Message] = []
+            heard: list[tuple[int, can.Message]] = []
             _wait_for_both(listener, contract, processes, options)
-            anchor_ns = time.monotonic_ns()
-            notifier = can.Notifier(listener, [heard.append], timeout=_POLL_S)
+            notifier = can.Notifier(
+                listener, [lambda message: heard.append((time.monotonic_ns(), message))], timeout=_POLL_S
+            )
             runner = RealtimeNode(supervisor, own, options.rt_ratio, Clock())
             ready_s = time.perf_counter()
             broken = ""
@@ -63,7 +65,7 @@ def run_realtime(options: RunOptions) -> Recording:
     played_ns = int(record["time_ns"][-1] - record["time_ns"][0]) + PERIOD_NS if len(record["time_ns"]) else 0
     ending = broken or (INTERRUPTED if options.stopped.is_set() else "")
     return Recording(
-        traffic=_traffic(heard, anchor_ns, options),
+        traffic=_traffic(heard, options.rt_ratio),
         supervisor=record,
         plant=load_record(options, "plant"),
         controller=load_record(options, "controller"),
@@ -150,13 +152,15 @@ def _until_done(supervisor: Supervisor, processes: NodeProcesses, options: RunOp
     return keep_running
 
 
-def _traffic(heard: list[can.Message], anchor_ns: int, options: RunOptions) -> np.ndarray:
-    """Put the log on the nodes' time base: the first frame is taken to be from the moment logging began."""
-    ratio = float(options.rt_ratio)
-    messages = [m for m in heard if not (m.is_error_frame or m.is_remote_frame or m.is_fd)]
-    first_s = messages[0].timestamp if messages else 0.0
+def _traffic(heard: list[tuple[int, can.Message]], ratio: Fraction) -> np.ndarray:
+    """Put the log on the nodes' time base: the frame that was passed on fastest ties the two clocks."""
+    data = [(ns, m) for ns, m in heard if not (m.is_error_frame or m.is_remote_frame or m.is_fd)]
+    offset_ns = min((ns - round(message.timestamp * 1e9) for ns, message in data), default=0)
     rows = [
-        (round(anchor_ns * ratio + (message.timestamp - first_s) * 1e9 * ratio), *to_frame(message))
-        for message in messages
+        (
+            (round(message.timestamp * 1e9) + offset_ns) * ratio.numerator // ratio.denominator,
+            *to_frame(message),
+        )
+        for _, message in data
     ]
     return np.array(rows, dtype=np.uint64).reshape(-1, 4)

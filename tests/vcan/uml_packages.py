@@ -29,7 +29,6 @@ def unpacked(cache: Path) -> Path:
     cache.mkdir(parents=True, exist_ok=True)
     with _locked(cache):  # of two first runs at once, one downloads
         if not root.is_dir():
-            (cache / ".gitignore").write_text("*\n")
             with tempfile.TemporaryDirectory(dir=cache, prefix="download-") as staging:
                 _download(Path(staging))
                 for archive in Path(staging).glob("*.deb"):
