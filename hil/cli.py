@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from dbc.contract import ContractError
+from dbc.contract import Contract, ContractError
 from hil.bus.hub import Hub, StopFlag
 from hil.bus.link import LinkError
 from hil.bus.wire import Wire
@@ -130,8 +130,9 @@ def _run(arguments: argparse.Namespace) -> int:
                 stopped=stopped,
             )
             recording = MODES[arguments.mode](options)
-        trace = trace_of(recording, scenario)
-        result = result_of(recording, trace, options, arguments.mode)
+        contract = Contract.load(arguments.dbc)
+        trace = trace_of(recording, scenario, contract)
+        result = result_of(recording, trace, contract, options, arguments.mode)
         files = folder.write(result, trace, recording.traffic)
     if arguments.json:
         print(json.dumps(result, indent=2))

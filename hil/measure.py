@@ -16,10 +16,6 @@ from hil.scenario import PERIOD_S, Scenario
 M_TO_MM = 1e3
 PA_TO_BAR = 1e-5
 RAD_S_TO_RPM = 30.0 / math.pi
-LSB_POSITION_M = 2.0**-31
-LSB_VELOCITY_M_S = 2.0**-38 / PERIOD_S
-LSB_ACCELERATION_M_S2 = 2.0**-40 / PERIOD_S**2
-LSB_DISTURBANCE_M_S3 = 2.0**-42 / PERIOD_S**3
 
 PLANT_COLUMNS = (  # trace column, record column, factor
     ("position_m", "position_m", 1.0),
@@ -36,19 +32,21 @@ CONTROLLER_COLUMNS = (
     ("target_velocity_rpm", "target_velocity_0p25rpm", 0.25),
     ("controller_state", "state", 1.0),
     ("controller_faults", "faults", 1.0),
-    ("td_position_m", "v1", LSB_POSITION_M),
-    ("td_velocity_m_s", "v2", LSB_VELOCITY_M_S),
-    ("td_acceleration_m_s2", "v3", LSB_ACCELERATION_M_S2),
-    ("eso_position_m", "z1", LSB_POSITION_M),
-    ("eso_velocity_m_s", "z2", LSB_VELOCITY_M_S),
-    ("eso_acceleration_m_s2", "z3", LSB_ACCELERATION_M_S2),
-    ("eso_disturbance_m_s3", "z4", LSB_DISTURBANCE_M_S3),
+)
+OBSERVER_COLUMNS = (  # trace column, record column, signal of ObserverState that carries its factor
+    ("td_position_m", "v1", "TdPosition"),
+    ("td_velocity_m_s", "v2", "TdVelocity"),
+    ("td_acceleration_m_s2", "v3", "TdAcceleration"),
+    ("eso_position_m", "z1", "EsoPosition"),
+    ("eso_velocity_m_s", "z2", "EsoVelocity"),
+    ("eso_acceleration_m_s2", "z3", "EsoAcceleration"),
+    ("eso_disturbance_m_s3", "z4", "EsoDisturbance"),
 )
 
 Trace = dict[str, np.ndarray]
 
 
-def trace_of(recording: Recording, scenario: Scenario) -> Trace:
+def trace_of(recording: Recording, scenario: Scenario, contract: Contract) -> Trace:
     """Merge the nodes' records by control period.
 
     Returns
@@ -59,7 +57,12 @@ def trace_of(recording: Recording, scenario: Scenario) -> Trace:
     played = round(recording.simulated_s / PERIOD_S) - _first_period(recording)
     rows = max(min(played, scenario.periods), 0)
     trace = {"time_s": np.arange(rows) * PERIOD_S, "reference_m": scenario.reference_m()[:rows]}
-    sources = ((recording.plant, PLANT_COLUMNS, 0), (recording.controller, CONTROLLER_COLUMNS, PHASE_NS))
+    signals = contract.observer_state.signals
+    observer = tuple((name, source, signals[signal].factor) for name, source, signal in OBSERVER_COLUMNS)
+    sources = (
+        (recording.plant, PLANT_COLUMNS, 0),
+        (recording.controller, CONTROLLER_COLUMNS + observer, PHASE_NS),
+    )
     for record, columns, phase_ns in sources:
         if record is None:
             continue
@@ -73,12 +76,13 @@ def trace_of(recording: Recording, scenario: Scenario) -> Trace:
     return trace
 
 
-def result_of(recording: Recording, trace: Trace, options: RunOptions, mode: str) -> dict[str, Any]:
+def result_of(
+    recording: Recording, trace: Trace, contract: Contract, options: RunOptions, mode: str
+) -> dict[str, Any]:
     """Return the figures of a run, as written to ``result.json``.
 
     RMS and maximum are over e(t_k) = r(t_k) - x(t_k), x being the plant's unquantised position.
     """
-    contract = Contract.load(options.dbc)
     scenario = options.scenario
     error_mm = trace.get("error_m", np.full(1, np.nan)) * M_TO_MM
     speed_rpm = trace.get("target_velocity_rpm", np.full(2, np.nan))

@@ -126,11 +126,11 @@ class Wire:
 
     def send(self, port: Port, ready_ns: int, frame: Frame) -> None:
         """Hand a frame to the port's CAN controller at bus time `ready_ns`, now or later."""
-        self._sequence += 1
         if ready_ns > self.now_ns or frame.can_id in self._out_of_band:
+            self._sequence += 1
             heappush(self._released, (max(ready_ns, self.now_ns), self._sequence, port, frame))
         else:
-            self._queue(port, self._sequence, frame)
+            self._queue(port, frame)
 
     def next_event_ns(self) -> int:
         """Return the bus time of the next event, `NEVER` if there is none."""
@@ -172,18 +172,19 @@ class Wire:
             self.send(port, to_bus(send_ns), frame)
 
     def _release(self) -> None:
-        _, sequence, port, frame = heappop(self._released)
+        _, _, port, frame = heappop(self._released)
         if frame.can_id in self._out_of_band:
             self._deliver(port, frame)
         else:
-            self._queue(port, sequence, frame)
+            self._queue(port, frame)
 
-    def _queue(self, port: Port, sequence: int, frame: Frame) -> None:
+    def _queue(self, port: Port, frame: Frame) -> None:
         can_id = frame.can_id
         key = self._keys.get(can_id)
         if key is None:
             key = self._keys[can_id] = arbitration_key(can_id)
-        heappush(self._pending, (key, port.order, sequence, port, frame))
+        self._sequence += 1
+        heappush(self._pending, (key, port.order, self._sequence, port, frame))
 
     def _arbitrate(self) -> None:
         _, _, _, port, frame = heappop(self._pending)

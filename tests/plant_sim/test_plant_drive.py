@@ -79,6 +79,9 @@ def drive_in(state, target=FULL_SPEED):
         (FAULT, DISABLE_VOLTAGE, FAULT),
         (FAULT, QUICK_STOP, FAULT),
         (FAULT, RESET, DISABLED),
+        # a controlword with bit 7 is a reset and nothing else
+        (READY, SWITCH_ON | RESET, READY),
+        (ENABLED, SHUTDOWN | RESET, ENABLED),
     ],
 )
 def test_transition(state, controlword, expected):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from plant_sim import PlantParameters, PumpModel, advance, initial_state, simulate
 from plant_sim import layout as at
+from plant_sim.hydraulics import chamber_volumes
 
 P = PlantParameters()
 
@@ -43,10 +44,13 @@ def test_with_a_leak_and_a_still_motor_the_held_load_creeps_in():
     assert 0.001 < 0.2 - trace.position_m[-1] < 0.01
 
 
-def test_the_machine_holds_the_same_oil_wherever_it_starts():
-    moved = simulate(np.full(2500, 100.0))
-    rest = initial_state(P, float(moved.position_m[-1]))
-    assert rest[at.OIL_VOLUME] == pytest.approx(moved.oil_volume_m3[-1], rel=0.01)
+@given(position_m=st.floats(0.0, P.stroke_m))
+def test_the_machine_holds_the_same_oil_wherever_it_starts(position_m):
+    state = initial_state(P, position_m)
+    swept_m3 = P.rod_area_m2 * position_m
+    rises_pa = state[[at.PRESSURE_A, at.PRESSURE_B]] - P.accumulator_precharge_pa
+    compressed_m3 = np.dot(chamber_volumes(position_m, P.vector()), rises_pa) / P.bulk_modulus_pa
+    assert state[at.OIL_VOLUME] + swept_m3 + compressed_m3 == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("position_m", [-0.001, 0.401, float("nan")])

@@ -1,0 +1,39 @@
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: run test test-long test-vcan check bench figures clean
+
+run: $(READY)  ## the main job: the 10 s sine under ADRC, three processes in lock-step
+	$(BIN)/hil run sine
+
+test: $(READY)  ## all tests that need nothing but this machine
+	$(BIN)/python -m pytest
+
+test-long: $(READY)  ## the tests that take minutes
+	$(BIN)/python -m pytest -m long
+
+test-vcan: $(READY)  ## the loop on a real vcan0, in a User-Mode Linux guest
+	$(BIN)/python -m pytest tests/vcan -m boots_guest
+	$(BIN)/python tests/vcan/guest.py --timeout-s 1200 -- $(BIN)/python -m pytest tests/vcan
+
+check: $(READY)  ## style, types, import rules, kernel subset
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m firmware_py.kernel_check
+
+bench: $(READY)  ## speed figures, measured side by side
+	$(BIN)/python tests/tools/bench.py
+
+figures: $(READY)  ## rewrite the figures in README from runs
+	$(BIN)/python tests/tools/readme_figures.py --write
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv out build dist *.egg-info

@@ -1,0 +1,131 @@
+"""Speed, measured side by side: ``make bench``.
+
+Every subject is run once to warm up, then in interleaved rounds, so that a noisy machine disturbs all alike;
+the median over the rounds counts. Multiples of real time are simulated seconds over wall seconds, without
+start-up and output files. Costs per step are of the jitted control step alone, replayed over the inputs of
+the scenario ("worst": random setpoints and positions, so that no linear zone saves a square root). A plain
+Python loop is timed in each round too, to compare machines by.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from firmware_py.compiled import control_reset, control_step
+from firmware_py.kernel import layout as k
+from firmware_py.tuning import Tuning
+from hil.closed_loop import run_closed_loop
+from hil.references import load_profile, setpoint_counts
+from hil.run.inprocess import run_inprocess
+from hil.run.lockstep import run_lockstep
+from hil.run.options import RunOptions
+from hil.scenario import PERIOD_S, Scenario, load_scenario
+
+OUTPUT = Path(__file__).parents[2] / "docs" / "bench.json"
+PYTHON_LOOP = 1_000_000
+
+
+@njit(cache=False)
+def _replay(calibration, state, io, setpoints, positions):
+    control_reset(calibration, state, io)
+    for i in range(setpoints.size):
+        io[k.IO_SETPOINT] = setpoints[i]
+        io[k.IO_POSITION] = positions[i]
+        control_step(calibration, state, io)
+
+
+def bus_run(run: Callable[[RunOptions], object], scenario: Scenario) -> float:
+    """Return multiples of real time of one run over the bus."""
+    with tempfile.TemporaryDirectory() as directory:
+        recording = run(RunOptions(scenario, "adrc", Path(directory)))
+    return recording.simulated_s / recording.wall_s
+
+
+def jitted_loop(scenario: Scenario) -> float:
+    """Return multiples of real time of kernel and plant in one jitted loop, without the bus."""
+    time_s = np.arange(scenario.periods) * PERIOD_S
+    setpoints, load_n = setpoint_counts(scenario.reference_m()), load_profile(time_s, scenario.load)
+    calibration = Tuning().calibration()
+    begin_s = time.perf_counter()
+    run_closed_loop(calibration, setpoints, load_n)
+    return scenario.duration_s / (time.perf_counter() - begin_s)
+
+
+def step_us(law: int, setpoints: np.ndarray, positions: np.ndarray, repeat: int = 20) -> float:
+    """Return the cost of one control step in µs, over given inputs (0.1 µm and 1 µm counts)."""
+    calibration = Tuning(law=law).calibration().array()
+    state, io = np.zeros(k.ST_SIZE, np.int32), np.zeros(k.IO_SIZE, np.int32)
+    io[k.IO_LAW] = law
+    io[k.IO_POSITION] = positions[0]
+    begin_s = time.perf_counter()
+    for _ in range(repeat):
+        _replay(calibration, state, io, setpoints, positions)
+    return (time.perf_counter() - begin_s) / repeat / setpoints.size * 1e6
+
+
+def python_loop_ms() -> float:
+    """Return the time of a fixed piece of plain Python, ms."""
+    begin_s = time.perf_counter()
+    sum(i * i for i in range(PYTHON_LOOP))
+    return (time.perf_counter() - begin_s) * 1e3
+
+
+def subjects() -> dict[str, Callable[[], float]]:
+    """Return what is measured, by the name it has in ``bench.json``."""
+    sine = load_scenario("sine")
+    setpoints = setpoint_counts(sine.reference_m())
+    run = run_closed_loop(Tuning().calibration(), setpoints, np.zeros(setpoints.size))
+    positions = np.floor(run.position_m * 1e6 + 0.5).astype(np.int32)
+    random = np.random.default_rng(1)
+    wild_setpoints = random.integers(0, 4_000_000, 10_000).astype(np.int32)
+    wild_positions = random.integers(0, 400_000, 10_000).astype(np.int32)
+    return {
+        "inprocess_x": lambda: bus_run(run_inprocess, sine),
+        "lockstep_x": lambda: bus_run(run_lockstep, sine),
+        "jitted_loop_x": lambda: jitted_loop(sine),
+        "adrc_step_sine_us": lambda: step_us(k.LAW_ADRC, setpoints, positions),
+        "adrc_step_worst_us": lambda: step_us(k.LAW_ADRC, wild_setpoints, wild_positions),
+        "pi_step_sine_us": lambda: step_us(k.LAW_PI, setpoints, positions),
+        "python_loop_ms": python_loop_ms,
+    }
+
+
+def main() -> int:
+    """Measure, print, and write ``docs/bench.json``."""
+    parser = argparse.ArgumentParser(description="Measure speed and write docs/bench.json.")
+    parser.add_argument("--rounds", type=int, default=9, help="interleaved rounds (default 9)")
+    arguments = parser.parse_args()
+    measured = subjects()
+    samples: dict[str, list[float]] = {name: [] for name in measured}
+    for measure in measured.values():
+        measure()
+    for number in range(arguments.rounds):
+        print(f"round {number + 1} of {arguments.rounds}", file=sys.stderr)
+        for name, measure in measured.items():
+            samples[name].append(measure())
+    figures = {
+        name: {"median": statistics.median(values), "min": min(values), "max": max(values)}
+        for name, values in samples.items()
+    }
+    for name, figure in figures.items():
+        print(f"{name:20} {figure['median']:10.3f}   ({figure['min']:.3f} .. {figure['max']:.3f})")
+    machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    machine["python"] = platform.python_version()
+    report = {"rounds": arguments.rounds, "machine": machine, "figures": figures}
+    OUTPUT.parent.mkdir(exist_ok=True)
+    OUTPUT.write_text(json.dumps(report, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
