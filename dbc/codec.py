@@ -71,7 +71,7 @@ class MessageCodec(Generic[P, T]):
 
     def frame(self, data: int) -> Frame:
         """Return the frame that carries a payload."""
-        return Frame(self.can_id, self.dlc, data)
+        return tuple.__new__(Frame, (self.can_id, self.dlc, data))
 
     def protector(self) -> Protector:
         """Return a sender's E2E state for this (protected) message."""

@@ -89,7 +89,7 @@ class Mailbox:
             if self._age_periods % self._cycle_periods == 0:
                 self._check(None)
             return
-        status = self._check(frame.data) if frame.dlc == self._dlc else Status.WRONGCRC
+        status = self._check(frame.data if frame.dlc == self._dlc else None)
         if status not in ACCEPTED:
             self.corrupt = status != Status.INITIAL
             return

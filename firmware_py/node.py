@@ -19,6 +19,7 @@ from firmware_py.state_machine import (
     ENABLE,
     FAULT_RESET,
     INPUTS_FRESH,
+    NOMINAL,
     READY_TO_ENABLE,
     State,
     next_state,
@@ -67,13 +68,14 @@ _CONTROLWORD_DISABLE_VOLTAGE = 0x00
 _CONTROLWORD_SHUTDOWN = 0x06
 
 _ENABLING_CONTROLWORDS = (  # CiA 402 statusword mask and value, the controlword that leads on from there
+    (_DRIVE_ENABLED_MASK, _DRIVE_ENABLED, 0x0F),
     (0x4F, 0x40, _CONTROLWORD_SHUTDOWN),  # switch on disabled
     (0x6F, 0x21, 0x07),  # ready to switch on
     (0x6F, 0x23, 0x0F),  # switched on
-    (_DRIVE_ENABLED_MASK, _DRIVE_ENABLED, 0x0F),
     (0x6F, 0x07, _CONTROLWORD_QUICK_STOP),  # quick stop active: let it finish
 )
 _FAULT_MASK, _FAULT = 0x4F, 0x08
+_STATUSWORD_FAULT_BIT = 0x08  # set while the fault reaction is active too
 
 
 class Controller:
@@ -151,6 +153,7 @@ class Controller:
         self._bench_reset = False
         self._state: int = State.POWER_ON
         self._faults = 0
+        self._overrun_fault = 0
         self._cycle = 0
         self._armed = False
         self._reset_asked = False
@@ -171,6 +174,8 @@ class Controller:
         mailbox = self._mailboxes.get(frame.can_id)
         if mailbox is not None:
             mailbox.receive(frame)
+            if mailbox.overruns:
+                self._overrun_fault = int(Fault.MAILBOX_OVERRUN)
         else:
             self._bench_reset |= self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET
         return NOTHING
@@ -183,7 +188,10 @@ class Controller:
             mailbox.poll()
         conditions = self._conditions()
         previous, self._state = self._state, next_state(self._state, conditions)
-        self._update_faults()
+        if conditions & NOMINAL == NOMINAL and self._state != State.SAFE:
+            self._faults = self._overrun_fault
+        else:
+            self._update_faults(left_run=previous == State.RUN)
         velocity = self._control(entered=previous != State.RUN) if self._state == State.RUN else 0
         drive_command = self._contract.drive_command
         payload = self._protect(drive_command.pack(self._controlword(conditions), velocity))
@@ -218,11 +226,11 @@ class Controller:
             | (FAULT_RESET if reset_edge else 0)
         )
 
-    def _update_faults(self) -> None:
+    def _update_faults(self, left_run: bool) -> None:
         """Show what is wrong now; in the safe state also what led there."""
         drive = self._drive_status.value
         statusword = drive.statusword if drive is not None else 0
-        faults = 0
+        faults = self._overrun_fault
         for mailbox, lost, corrupt, invalid in (
             (self._feedback, Fault.FEEDBACK_LOST, Fault.FEEDBACK_CORRUPT, Fault.FEEDBACK_INVALID),
             (self._setpoint, Fault.SETPOINT_LOST, Fault.SETPOINT_CORRUPT, Fault.SETPOINT_INVALID),
@@ -231,14 +239,12 @@ class Controller:
         ):
             if mailbox.stale:
                 faults |= lost | (corrupt if mailbox.corrupt else 0) | (invalid if mailbox.invalid else 0)
-            if mailbox.overruns:
-                faults |= Fault.MAILBOX_OVERRUN
         if self._calibration is None:
             faults |= Fault.CALIBRATION_INVALID
-        if statusword & _FAULT_MASK == _FAULT:
+        if statusword & _STATUSWORD_FAULT_BIT:
             faults |= Fault.DRIVE_FAULT
         if self._state == State.SAFE:
-            if statusword & _DRIVE_ENABLED_MASK != _DRIVE_ENABLED and not self._faults:
+            if left_run and statusword & _DRIVE_ENABLED_MASK != _DRIVE_ENABLED:
                 faults |= Fault.DRIVE_NOT_ENABLED
             faults |= self._faults
         self._faults = faults

@@ -21,6 +21,7 @@ DRIVE_ENABLED = 8
 FAULT_RESET = 16
 
 READY_TO_ENABLE = ENABLE | INPUTS_FRESH
+NOMINAL = CALIBRATED | INPUTS_FRESH | DRIVE_ENABLED
 
 
 class Transition(NamedTuple):
@@ -42,9 +43,16 @@ TRANSITIONS = (
 )
 
 
-def next_state(state: int, conditions: int) -> int:
-    """Return the target of the first transition that applies, or `state`."""
+def _first_target(state: int, conditions: int) -> int:
     for source, when, unless, target in TRANSITIONS:
         if source == state and conditions & when == when and not conditions & unless:
             return target
     return state
+
+
+_NEXT = tuple(tuple(_first_target(state, conditions) for conditions in range(32)) for state in State)
+
+
+def next_state(state: int, conditions: int) -> int:
+    """Return the target of the first transition that applies, or `state`."""
+    return _NEXT[state][conditions]

@@ -84,9 +84,14 @@ _AFTER_RAMP = {
 }
 
 
+_COMMANDS = tuple(
+    next(command for mask, value, command in _COMMAND_MASKS if bits & mask == value) for bits in range(16)
+)
+
+
 def decode_controlword(controlword: int) -> Command:
     """Return what controlword 0x6040 asks for, fault reset aside."""
-    return next(command for mask, value, command in _COMMAND_MASKS if controlword & mask == value)
+    return _COMMANDS[controlword & 0x0F]
 
 
 class Drive:

@@ -23,6 +23,7 @@ _STATUS_PHASE = 2
 _PRESSURE_PHASE = 4
 _COUNTS_PER_RAD_S = 30.0 * COUNTS_PER_RPM / math.pi
 _RESET_LSB_M = 1e-7
+_MAX_LOAD_N = 1e6
 _SENSOR_OK = 0
 
 
@@ -62,6 +63,7 @@ class Plant:
             for message in (contract.drive_command, contract.bench_control, contract.bench_load)
         )
         self.latched = self.accepts
+        self._command_id = contract.drive_command.can_id
         self.transmits = frozenset(
             message.can_id
             for message in (contract.position_feedback, contract.drive_status, contract.pressure_feedback)
@@ -88,7 +90,8 @@ class Plant:
         self._check = contract.drive_command.checker().check
         self._protect_position = contract.position_feedback.protector().protect
         self._protect_status = contract.drive_status.protector().protect
-        self._mailbox: dict[int, Frame] = {}
+        self._command_frame: Frame | None = None
+        self._bench_frames: dict[int, Frame] = {}
         self._time_ns = next_period(now_ns)
         self._speed_command_rad_s = 0.0
         self._load_n = 0.0
@@ -97,13 +100,17 @@ class Plant:
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
         """Latch: the newest frame of each id."""
-        self._mailbox[frame.can_id] = frame
+        if frame.can_id == self._command_id:
+            self._command_frame = frame
+        else:
+            self._bench_frames[frame.can_id] = frame
         return NOTHING
 
     def on_timer(self, now_ns: int) -> Actions:
         """Simulate up to now, send what the sensors say, and let the drive take its command."""
         contract = self._contract
-        self._take_bench_frames()
+        if self._bench_frames:
+            self._take_bench_frames()
         state = self._state
         while self._time_ns + PERIOD_NS <= now_ns:
             advance(state, self._vector, self._speed_command_rad_s, self._load_n, _PERIOD_S, SUBSTEPS)
@@ -150,18 +157,20 @@ class Plant:
 
     def _take_bench_frames(self) -> None:
         contract = self._contract
-        frame = self._mailbox.pop(contract.bench_control.can_id, None)
+        frame = self._bench_frames.pop(contract.bench_control.can_id, None)
         if frame is not None:
             control = contract.bench_control.unpack(frame.data)
             if control.command == BenchCommand.RESET:
-                self._restart(control.value * _RESET_LSB_M)
-        frame = self._mailbox.pop(contract.bench_load.can_id, None)
+                position_m = control.value * _RESET_LSB_M
+                self._restart(min(max(position_m, 0.0), self._parameters.stroke_m))
+        frame = self._bench_frames.pop(contract.bench_load.can_id, None)
         if frame is not None:
-            self._load_n = float(contract.bench_load.unpack(frame.data).force)
+            force_n = float(contract.bench_load.unpack(frame.data).force)
+            self._load_n = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
 
     def _drive_command(self) -> tuple[int, int] | None:
         message = self._contract.drive_command
-        frame = self._mailbox.pop(message.can_id, None)
+        frame, self._command_frame = self._command_frame, None
         if frame is None or frame.dlc != message.dlc:
             self._check(None)
             return None

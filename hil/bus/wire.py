@@ -45,6 +45,7 @@ class Port:
     order: int
     clock: Clock
     connected: bool = True
+    on_bus_time: bool = False
 
 
 @dataclass(slots=True)
@@ -106,7 +107,8 @@ class Wire:
         """
         if any(port.connected and port.node.name == node.name for port in self._ports):
             raise ValueError(f"there is a node named {node.name!r} on this bus already")
-        port = Port(node, len(self._ports), clock or Clock())
+        clock = clock or Clock()
+        port = Port(node, len(self._ports), clock, on_bus_time=clock == Clock())
         self._ports.append(port)
         self._wakes.append(NEVER)
         self._routes.clear()
@@ -159,17 +161,21 @@ class Wire:
         self.now_ns = max(self.now_ns, until_ns)
 
     def _wake(self) -> None:
-        port = self._ports[self._wakes.index(self.now_ns)]
-        self._wakes[port.order] = NEVER
-        self._apply(port, port.node.on_timer(port.clock.local(self.now_ns)))
+        now_ns = self.now_ns
+        order = self._wakes.index(now_ns)
+        port = self._ports[order]
+        self._wakes[order] = NEVER
+        local_ns = now_ns if port.on_bus_time else port.clock.local(now_ns)
+        self._apply(port, port.node.on_timer(local_ns))
 
     def _apply(self, port: Port, actions: Actions) -> None:
         wake_ns, sends = actions
-        to_bus = port.clock.bus
+        on_bus_time, to_bus = port.on_bus_time, port.clock.bus
         if wake_ns is not None:
-            self._wakes[port.order] = max(to_bus(wake_ns), self.now_ns)
+            wake_ns = wake_ns if on_bus_time else to_bus(wake_ns)
+            self._wakes[port.order] = wake_ns if wake_ns > self.now_ns else self.now_ns
         for send_ns, frame in sends:
-            self.send(port, to_bus(send_ns), frame)
+            self.send(port, send_ns if on_bus_time else to_bus(send_ns), frame)
 
     def _release(self) -> None:
         _, _, port, frame = heappop(self._released)
@@ -188,7 +194,7 @@ class Wire:
 
     def _arbitrate(self) -> None:
         _, _, _, port, frame = heappop(self._pending)
-        bits = classic_bits(frame.can_id, frame.dlc, frame.data)
+        bits = classic_bits(*frame)
         start_ns = self.now_ns
         self._on_wire = port, frame
         self._end_ns = start_ns + (bits - INTERMISSION_BITS) * _NS_PER_S // self.bit_rate
@@ -198,7 +204,8 @@ class Wire:
     def _finish_frame(self) -> None:
         assert self._on_wire is not None
         port, frame = self._on_wire
-        self._on_wire, self._end_ns = None, NEVER
+        self._on_wire = None
+        self._end_ns = NEVER
         self._deliver(port, frame)
 
     def _deliver(self, sender: Port, frame: Frame) -> None:
@@ -206,7 +213,8 @@ class Wire:
         self.traffic.cells.extend((now_ns, *frame))
         for port in self._routes.get(frame.can_id) or self._route(frame.can_id):
             if port is not sender:
-                actions = port.node.on_frame(port.clock.local(now_ns), frame)
+                local_ns = now_ns if port.on_bus_time else port.clock.local(now_ns)
+                actions = port.node.on_frame(local_ns, frame)
                 if actions is not NOTHING:
                     self._apply(port, actions)
 

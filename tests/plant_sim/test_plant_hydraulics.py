@@ -78,6 +78,20 @@ def test_inflow_falls_with_pressure_and_its_piece_holds_between_its_ends(pressur
         assert inflow(pressure, flow, loss) >= inflow(other, flow, loss)
 
 
+@pytest.mark.parametrize(
+    ("excess_pa", "low_pa", "high_pa"),
+    [
+        (-2e5, -np.inf, -1e5),
+        (-0.5e5, -1e5, -0.2e5),
+        (0.0, -0.2e5, 1e5),
+        (5e5, 1e5, 160e5),
+        (170e5, 160e5, np.inf),
+    ],
+)
+def test_a_piece_ends_where_a_valve_opens_or_the_loss_is_complete(excess_pa, low_pa, high_pa):
+    assert chamber_inflow(LINE_PA + excess_pa, 0.0, 1e-5, LINE_PA, VECTOR)[2:] == (low_pa, high_pa)
+
+
 def test_accumulator_holds_its_precharge_and_follows_the_polytrope():
     assert accumulator_pressure(0.0, VECTOR) == pytest.approx(3.5e5)
     assert accumulator_pressure(-1.3e-3, VECTOR) == pytest.approx(3.5e5 / 2**1.3)

@@ -1,0 +1,138 @@
+"""Runs of the bench that the tests of this room share."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from dbc.contract import Contract
+from hil.measure import Trace, result_of, trace_of
+from hil.run.inprocess import run_inprocess
+from hil.run.options import Recording, RunOptions
+from hil.scenario import Scenario, load_scenario
+
+SAFETY_NET_S = 120.0
+"""Longer than anything takes on the slowest machine; reached only when something hangs."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """A run and what was measured of it."""
+
+    recording: Recording
+    trace: Trace
+    result: dict[str, Any]
+
+
+@cache
+def played(scenario: str, controller: str = "adrc", bit_rate: int = 1_000_000) -> Played:
+    """Play a built-in scenario in full, in this process, once for all tests."""
+    options = RunOptions(load_scenario(scenario), controller, Path(), bit_rate=bit_rate)
+    recording = run_inprocess(options)
+    contract = Contract.load()
+    trace = trace_of(recording, options.scenario, contract)
+    return Played(recording, trace, result_of(recording, trace, contract, options, "inprocess"))
+
+
+def short_scenario(
+    duration_s: float = 0.5, load: tuple[tuple[float, float], ...] = (), reference: str = "sine"
+) -> Scenario:
+    return Scenario("short", "a short one", reference, duration_s, load, {}, {})
+
+
+def sha256(recording: Recording) -> str:
+    return hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest()
+
+
+def hil(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "hil", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=SAFETY_NET_S,
+        env=os.environ | environment,
+    )
+
+
+@contextmanager
+def background(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a Python module in the background and make sure that it ends with the test."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def wait_until(happened: Callable[[], Any], what: str) -> Any:
+    """Poll until something is true, and return it."""
+    deadline_s = time.monotonic() + SAFETY_NET_S
+    while not (value := happened()):
+        assert time.monotonic() < deadline_s, f"waited in vain until {what}"
+        time.sleep(0.01)
+    return value
+
+
+@contextmanager
+def busy_machine(processes: int = 2) -> Iterator[None]:
+    """Keep every core busy with something else."""
+    burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+def children(pid: int) -> list[int]:
+    """Return the living children of a process."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal() and (fields := _stat(int(entry.name))) and int(fields[1]) == pid:
+            found.append(int(entry.name))
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Tell whether a process still runs; one that only waits to be reaped does not."""
+    fields = _stat(pid)
+    return fields is not None and fields[0] not in "ZX"
+
+
+def command_line(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    except OSError:
+        return ""
+
+
+def _stat(pid: int) -> list[str] | None:
+    """Return the fields of /proc/PID/stat from the state on."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+
+
+@contextmanager
+def scratch_directory() -> Iterator[Path]:
+    with TemporaryDirectory() as name:
+        yield Path(name)
