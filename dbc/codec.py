@@ -4,7 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, ParamSpec, TypeVar
 
-from dbc.e2e import Checker, Protector
+import numpy as np
+
+from dbc.e2e import Checker, Protector, receiver_configuration
 from dbc.frame import Frame
 
 P = ParamSpec("P")
@@ -31,7 +33,7 @@ class Signal:
     choices: Mapping[int, str]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MessageCodec(Generic[P, T]):
     """One message of the contract.
 
@@ -51,6 +53,8 @@ class MessageCodec(Generic[P, T]):
         Whether the message is out of band: no bus load, no response-time analysis.
     signals : mapping of str to Signal
         All signals by their DBC names, in the order of their start bits.
+    fields : sequence of FieldBits
+        Where the layout's fields lie, in the layout's order.
     pack : callable
         Raw integers (plain int, one per field of the layout) to the payload as an unsigned integer, byte 0 in
         the low eight bits. E2E CRC and counter are left 0. Raises OverflowError for a value that does not fit
@@ -66,6 +70,7 @@ class MessageCodec(Generic[P, T]):
     data_ids: tuple[int, ...] | None
     bench_channel: bool
     signals: Mapping[str, Signal]
+    fields: Sequence["FieldBits"]
     pack: Callable[P, int]
     unpack: Callable[[int], T]
 
@@ -80,6 +85,10 @@ class MessageCodec(Generic[P, T]):
     def checker(self) -> Checker:
         """Return a receiver's E2E state for this (protected) message."""
         return Checker(self._protected_ids(), self.dlc)
+
+    def receiver_configuration(self) -> np.ndarray:
+        """Return what `dbc.e2e.profile2_check` needs to know of this (protected) message."""
+        return receiver_configuration(self._protected_ids(), self.dlc)
 
     def _protected_ids(self) -> tuple[int, ...]:
         if self.data_ids is None:

@@ -128,6 +128,7 @@ class _Reader:
             data_ids=self._data_ids(message) if protected else None,
             bench_channel=bench_channel,
             signals={signal.name: _physical(signal) for signal in message.signals},
+            fields=fields,
             pack=generate_pack(name, fields),
             unpack=generate_unpack(layout, fields),
         )

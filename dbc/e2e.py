@@ -9,6 +9,8 @@ A CRC finds errors; it does not authenticate.
 from collections.abc import Sequence
 from enum import IntEnum
 
+import numpy as np
+
 from dbc.jit import njit
 
 MAX_COUNTER = 15
@@ -55,6 +57,117 @@ def profile2_crc(data: int, dlc: int, data_id: int) -> int:
     return crc ^ 0xFF
 
 
+# a receiver's configuration: 16 DataIDs, then
+DLC = 16  # payload length in bytes
+MAX_DELTA_COUNTER_INIT = 17
+MAX_NO_NEW_OR_REPEATED_DATA = 18
+SYNC_COUNTER_INIT = 19
+CONFIGURATION_SIZE = 20
+
+# a receiver's state, int64 words
+NOT_FIRST = 0  # whether there has been valid data
+LAST_VALID_COUNTER = 1
+MAX_DELTA_COUNTER = 2
+SYNC_COUNTER = 3
+NO_NEW_OR_REPEATED_DATA_COUNTER = 4
+LOST_DATA = 5
+STATE_SIZE = 6
+
+_OK = int(Status.OK)
+_NONEWDATA = int(Status.NONEWDATA)
+_WRONGCRC = int(Status.WRONGCRC)
+_SYNC = int(Status.SYNC)
+_INITIAL = int(Status.INITIAL)
+_REPEATED = int(Status.REPEATED)
+_OKSOMELOST = int(Status.OKSOMELOST)
+_WRONGSEQUENCE = int(Status.WRONGSEQUENCE)
+
+
+@njit("int64(int64[::1], int64[::1], uint64, int64)")
+def profile2_check(state, configuration, data, arrived):  # type: ignore[no-untyped-def]
+    """``E2E_P02Check``: return the status of one received payload.
+
+    Parameters
+    ----------
+    state : array of int64, shape (STATE_SIZE,)
+        The receiver's state, updated in place; all zero at power-on.
+    configuration : array of int64, shape (CONFIGURATION_SIZE,)
+        As from `receiver_configuration`.
+    data : int
+        Payload as an unsigned integer, byte 0 in the low eight bits.
+    arrived : int
+        0 if nothing arrived since the last call; `data` is not looked at then.
+    """
+    if state[MAX_DELTA_COUNTER] < MAX_COUNTER:
+        state[MAX_DELTA_COUNTER] += 1
+    if not arrived:
+        if state[NO_NEW_OR_REPEATED_DATA_COUNTER] < MAX_COUNTER:
+            state[NO_NEW_OR_REPEATED_DATA_COUNTER] += 1
+        return _NONEWDATA
+    counter = np.int64(data >> np.uint64(8)) & MAX_COUNTER
+    crc = profile2_crc(data, configuration[DLC], configuration[counter])
+    if crc != np.int64(data & np.uint64(0xFF)):
+        return _WRONGCRC
+    delta = (counter - state[LAST_VALID_COUNTER]) & MAX_COUNTER
+    if not state[NOT_FIRST]:
+        state[NOT_FIRST] = 1
+        status = _INITIAL
+    elif delta == 0:
+        if state[NO_NEW_OR_REPEATED_DATA_COUNTER] < MAX_COUNTER:
+            state[NO_NEW_OR_REPEATED_DATA_COUNTER] += 1
+        return _REPEATED
+    elif delta > state[MAX_DELTA_COUNTER]:  # SWS_E2E_00145: the counter jumped too far
+        state[NO_NEW_OR_REPEATED_DATA_COUNTER] = 0
+        state[SYNC_COUNTER] = configuration[SYNC_COUNTER_INIT]
+        if configuration[SYNC_COUNTER_INIT] == 0:
+            return _WRONGSEQUENCE
+        status = _WRONGSEQUENCE
+    else:  # SWS_E2E_00298, 00299: good once enough counters in a row were valid
+        stale = state[NO_NEW_OR_REPEATED_DATA_COUNTER] > configuration[MAX_NO_NEW_OR_REPEATED_DATA]
+        state[NO_NEW_OR_REPEATED_DATA_COUNTER] = 0
+        state[LOST_DATA] = delta - 1
+        if stale:
+            state[SYNC_COUNTER] = configuration[SYNC_COUNTER_INIT]
+            status = _SYNC
+        elif state[SYNC_COUNTER] > 0:
+            state[SYNC_COUNTER] -= 1
+            status = _SYNC
+        else:
+            status = _OK if delta == 1 else _OKSOMELOST
+    state[MAX_DELTA_COUNTER] = configuration[MAX_DELTA_COUNTER_INIT]
+    state[LAST_VALID_COUNTER] = counter
+    return status
+
+
+def receiver_configuration(
+    data_ids: Sequence[int],
+    dlc: int,
+    *,
+    max_delta_counter_init: int = 1,
+    max_no_new_or_repeated_data: int = 3,
+    sync_counter_init: int = 1,
+) -> np.ndarray:
+    """Return a receiver's configuration as `profile2_check` takes it.
+
+    Parameters
+    ----------
+    data_ids : sequence of int
+        The message's 16 DataIDs, indexed by the counter.
+    dlc : int
+        Payload length in bytes, 2..8. A frame of another length is the caller's to refuse.
+    max_delta_counter_init : int
+        Largest step of the counter accepted, one more than this at the first check after valid data and
+        growing by one with every further check (SWS_E2E_00136).
+    max_no_new_or_repeated_data : int
+        Consecutive checks without new data after which the counter has to be synchronised again.
+    sync_counter_init : int
+        Valid counters in a row needed for that synchronisation. With 0, a wrong sequence does not move the
+        expected counter.
+    """
+    words = (dlc, max_delta_counter_init, max_no_new_or_repeated_data, sync_counter_init)
+    return np.array([*_checked_data_ids(data_ids), *words], np.int64)
+
+
 class Protector:
     """Sender side: ``E2E_P02Protect`` with its state.
 
@@ -86,111 +199,24 @@ class Checker:
 
     Parameters
     ----------
-    data_ids : sequence of int
-        The message's 16 DataIDs, indexed by the counter.
-    dlc : int
-        Payload length in bytes, 2..8. A frame of another length is the caller's to refuse.
-    max_delta_counter_init : int
-        The largest step of the counter that is accepted is one more than this at the first check after valid
-        data, and grows by one with every further check (SWS_E2E_00136).
-    max_no_new_or_repeated_data : int
-        Consecutive checks without new data after which the counter has to be synchronised again.
-    sync_counter_init : int
-        Valid counters in a row needed for that synchronisation. With 0, a wrong sequence does not move the
-        expected counter.
-
-    Attributes
-    ----------
-    lost_data : int
-        Messages lost before the last valid one; meaningful for `Status.OK` and `Status.OKSOMELOST`.
+    data_ids, dlc, **configuration
+        As for `receiver_configuration`.
     """
 
-    __slots__ = (
-        "_data_ids",
-        "_dlc",
-        "_last_valid_counter",
-        "_max_delta_counter",
-        "_max_delta_counter_init",
-        "_max_no_new_or_repeated_data",
-        "_no_new_or_repeated_data_counter",
-        "_sync_counter",
-        "_sync_counter_init",
-        "_wait_for_first_data",
-        "lost_data",
-    )
+    __slots__ = ("_configuration", "_state")
 
-    def __init__(
-        self,
-        data_ids: Sequence[int],
-        dlc: int,
-        *,
-        max_delta_counter_init: int = 1,
-        max_no_new_or_repeated_data: int = 3,
-        sync_counter_init: int = 1,
-    ) -> None:
-        self._data_ids = _checked_data_ids(data_ids)
-        self._dlc = dlc
-        self._max_delta_counter_init = max_delta_counter_init
-        self._max_no_new_or_repeated_data = max_no_new_or_repeated_data
-        self._sync_counter_init = sync_counter_init
-        self._last_valid_counter = 0
-        self._max_delta_counter = 0
-        self._wait_for_first_data = True
-        self._sync_counter = 0
-        self._no_new_or_repeated_data_counter = 0
-        self.lost_data = 0
+    def __init__(self, data_ids: Sequence[int], dlc: int, **configuration: int) -> None:
+        self._configuration = receiver_configuration(data_ids, dlc, **configuration)
+        self._state = np.zeros(STATE_SIZE, np.int64)
+
+    @property
+    def lost_data(self) -> int:
+        """Messages lost before the last valid one; meaningful for `Status.OK` and `Status.OKSOMELOST`."""
+        return int(self._state[LOST_DATA])
 
     def check(self, data: int | None) -> Status:
         """Check one received payload; None means that nothing arrived since the last call."""
-        if self._max_delta_counter < MAX_COUNTER:
-            self._max_delta_counter += 1
-        if data is None:
-            self._count_no_new_or_repeated_data()
-            return Status.NONEWDATA
-        counter = data >> 8 & MAX_COUNTER
-        if profile2_crc(data, self._dlc, self._data_ids[counter]) != data & 0xFF:
-            return Status.WRONGCRC
-        if self._wait_for_first_data:
-            self._wait_for_first_data = False
-            self._accept(counter)
-            return Status.INITIAL
-        delta = (counter - self._last_valid_counter) & MAX_COUNTER
-        if delta == 0:
-            self._count_no_new_or_repeated_data()
-            return Status.REPEATED
-        if delta > self._max_delta_counter:
-            return self._wrong_sequence(counter)
-        self._accept(counter)
-        self.lost_data = delta - 1
-        return self._synchronise(Status.OK if delta == 1 else Status.OKSOMELOST)
-
-    def _accept(self, counter: int) -> None:
-        self._max_delta_counter = self._max_delta_counter_init
-        self._last_valid_counter = counter
-
-    def _count_no_new_or_repeated_data(self) -> None:
-        if self._no_new_or_repeated_data_counter < MAX_COUNTER:
-            self._no_new_or_repeated_data_counter += 1
-
-    def _wrong_sequence(self, counter: int) -> Status:
-        """SWS_E2E_00145: the counter jumped too far."""
-        self._no_new_or_repeated_data_counter = 0
-        self._sync_counter = self._sync_counter_init
-        if self._sync_counter > 0:
-            self._accept(counter)
-        return Status.WRONGSEQUENCE
-
-    def _synchronise(self, synchronised: Status) -> Status:
-        """SWS_E2E_00298, 00299: `synchronised` once enough counters in a row were valid, else SYNC."""
-        stale = self._no_new_or_repeated_data_counter > self._max_no_new_or_repeated_data
-        self._no_new_or_repeated_data_counter = 0
-        if stale:
-            self._sync_counter = self._sync_counter_init
-            return Status.SYNC
-        if self._sync_counter > 0:
-            self._sync_counter -= 1
-            return Status.SYNC
-        return synchronised
+        return Status(profile2_check(self._state, self._configuration, data or 0, data is not None))
 
 
 def _checked_data_ids(data_ids: Sequence[int]) -> tuple[int, ...]:

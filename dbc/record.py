@@ -24,6 +24,11 @@ class Record:
         self._cells: array[Any] = array(typecode)
         self.append: Callable[[tuple[float, ...]], None] = self._cells.extend
 
+    def amend(self, column: str, value: float) -> None:
+        """Change a cell of the last row; do nothing before the first one."""
+        if self._cells:
+            self._cells[self.columns.index(column) - len(self.columns)] = value
+
     def columns_by_name(self) -> dict[str, np.ndarray]:
         """Return each column as an array of the number of rows."""
         table = np.array(self._cells).reshape(-1, len(self.columns))

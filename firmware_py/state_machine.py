@@ -3,6 +3,8 @@
 from enum import IntEnum
 from typing import NamedTuple
 
+import numpy as np
+
 
 class State(IntEnum):
     """Controller state, as in ControllerStatus."""
@@ -21,7 +23,6 @@ DRIVE_ENABLED = 8
 FAULT_RESET = 16
 
 READY_TO_ENABLE = ENABLE | INPUTS_FRESH
-NOMINAL = CALIBRATED | INPUTS_FRESH | DRIVE_ENABLED
 
 
 class Transition(NamedTuple):
@@ -43,16 +44,13 @@ TRANSITIONS = (
 )
 
 
-def _first_target(state: int, conditions: int) -> int:
+def next_state(state: int, conditions: int) -> int:
+    """Return the target of the first transition that applies, or `state`."""
     for source, when, unless, target in TRANSITIONS:
         if source == state and conditions & when == when and not conditions & unless:
             return target
     return state
 
 
-_NEXT = tuple(tuple(_first_target(state, conditions) for conditions in range(32)) for state in State)
-
-
-def next_state(state: int, conditions: int) -> int:
-    """Return the target of the first transition that applies, or `state`."""
-    return _NEXT[state][conditions]
+NEXT_STATE = np.array([[next_state(state, conditions) for conditions in range(32)] for state in State])
+"""`next_state` as a table over states and conditions."""

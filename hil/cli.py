@@ -54,10 +54,14 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser(
-        "run", help="play a scenario", epilog=EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
+        "run",
+        help="play a scenario",
+        usage="hil run SCENARIO [options]",
+        epilog=EXIT_CODES,
+        formatter_class=_OneLineEach,
     )
     run.set_defaults(command=_run)
-    run.add_argument("scenario", help="name (see `hil list`) or .toml file")
+    run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
     run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
     run.add_argument("--mode", choices=MODES, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default out/SCENARIO)")
@@ -70,8 +74,8 @@ def _parser() -> argparse.ArgumentParser:
         "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
     )
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)")
-    run.add_argument("-i", "--interface", help="realtime: python-can interface (default: a hub of its own)")
-    run.add_argument("-c", "--channel", help="realtime: its channel; lockstep: name that listeners attach to")
+    run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface")
+    run.add_argument("-c", "--channel", metavar="C", help="realtime: its channel; lockstep: for listeners")
     run.add_argument(
         "--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower"
     )
@@ -93,6 +97,13 @@ def _parser() -> argparse.ArgumentParser:
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)
     return parser
+
+
+class _OneLineEach(argparse.RawDescriptionHelpFormatter):
+    """Help with each option on a line of its own, to fit a screen."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=40)
 
 
 def _seconds(text: str) -> float:
@@ -156,7 +167,7 @@ def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
         TextColumn("{task.fields[at]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"{name}: starting", total=duration_s, at="")
 
         def advance(simulated_s: float) -> None:

@@ -167,6 +167,7 @@ class Plant:
         if frame is not None:
             force_n = float(contract.bench_load.unpack(frame.data).force)
             self._load_n = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
+            self.record.amend("load_n", self._load_n)  # it acts in all of the period that now ends
 
     def _drive_command(self) -> tuple[int, int] | None:
         message = self._contract.drive_command

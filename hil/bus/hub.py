@@ -273,7 +273,8 @@ class Hub:
             self.nodes[hello["name"]] = RemoteNode(connection, hello, self._answer_timeout_s)
             return
         self._names += 1
-        participant = Participant(connection, hello.get("name") or f"participant {self._names}")
+        is_node = hello["role"] == "node"
+        participant = Participant(connection, hello["name"] if is_node else f"participant {self._names}")
         port = self.wire.attach(participant)
         self._participants[connection.fileno()] = port, participant, connection
         self._selector.register(connection, selectors.EVENT_READ)
@@ -281,7 +282,9 @@ class Hub:
     def _refusal(self, hello: dict[str, Any]) -> str | None:
         if hello.get("version") != link.PROTOCOL_VERSION:
             return f"the hub speaks protocol {link.PROTOCOL_VERSION}: use the same release on both sides"
-        name = hello.get("name")
+        if not _is_complete(hello):
+            return "the greeting is incomplete: use the same release on both sides"
+        name = hello["name"] if hello["role"] == "node" else None
         taken = set(self.nodes) | {entry[1].name for entry in self._participants.values()}
         if name in taken:
             return f"channel {self.channel!r} has a {name} already: stop it or choose another channel"
@@ -304,6 +307,19 @@ class Hub:
         self.wire.detach(port)
         del self._participants[fd]
         connection.close()
+
+
+def _is_complete(hello: dict[str, Any]) -> bool:
+    """Tell whether a greeting has all that its role needs."""
+    if hello.get("role") == "bus":
+        return True
+    accepts = hello.get("accepts", ())
+    ids = [hello.get("latched"), hello.get("transmits"), [] if accepts is None else accepts]
+    return (
+        hello.get("role") == "node"
+        and isinstance(hello.get("name"), str)
+        and all(isinstance(group, list) and all(isinstance(i, int) for i in group) for group in ids)
+    )
 
 
 class StopFlag:

@@ -54,13 +54,14 @@ def make_wire(contract: Contract, bit_rate: int) -> Wire:
 def play(wire: Wire, supervisor: Supervisor, options: RunOptions, service: Callable[[], None]) -> str:
     """Run the wire to the end of the scenario; return what ended it earlier, or nothing."""
     end_ns = supervisor.periods * PERIOD_NS
-    while wire.now_ns < end_ns:
-        if options.stopped.is_set():
-            return INTERRUPTED
+    while True:
         wire.run(min(wire.now_ns + SERVICE_NS, end_ns))
         service()
         options.progress(wire.now_ns / 1e9)
-    return ""
+        if wire.now_ns >= end_ns:
+            return ""
+        if options.stopped.is_set():
+            return INTERRUPTED
 
 
 def traffic_of(wire: Wire) -> np.ndarray:

@@ -10,10 +10,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from threading import Thread
 from typing import Any
 
 from dbc.contract import Contract
+from hil.bus.hub import Hub, StopFlag
+from hil.bus.wire import Wire
 from hil.measure import Trace, result_of, trace_of
 from hil.run.inprocess import run_inprocess
 from hil.run.options import Recording, RunOptions
@@ -91,6 +93,20 @@ def wait_until(happened: Callable[[], Any], what: str) -> Any:
 
 
 @contextmanager
+def serving(channel: str) -> Iterator[Hub]:
+    """Serve a bus in wall time from a thread."""
+    stopped = StopFlag()
+    with Hub(Wire(1_000_000), channel, virtual=False) as hub:
+        server = Thread(target=hub.run_in_wall_time, args=(lambda: not stopped.is_set(),))
+        server.start()
+        try:
+            yield hub
+        finally:
+            stopped.set()
+            server.join()
+
+
+@contextmanager
 def busy_machine(processes: int = 2) -> Iterator[None]:
     """Keep every core busy with something else."""
     burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
@@ -130,9 +146,3 @@ def _stat(pid: int) -> list[str] | None:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return None
-
-
-@contextmanager
-def scratch_directory() -> Iterator[Path]:
-    with TemporaryDirectory() as name:
-        yield Path(name)

@@ -1,13 +1,13 @@
 """Fixtures of the bench's tests."""
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Thread
 
 import pytest
+from bench_runs import serving
 
-from hil.bus.hub import Hub, StopFlag
-from hil.bus.wire import Wire
+from hil.bus.hub import Hub
 
 
 @pytest.fixture(autouse=True)
@@ -17,15 +17,17 @@ def socket_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture(autouse=True)
+def signal_handlers() -> Iterator[None]:
+    """Put back what the command line sets."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture
 def hub() -> Iterator[Hub]:
-    """A bus in wall time on channel "test", served by a thread."""
-    stopped = StopFlag()
-    with Hub(Wire(1_000_000), "test", virtual=False) as hub:
-        server = Thread(target=hub.run_in_wall_time, args=(lambda: not stopped.is_set(),))
-        server.start()
-        try:
-            yield hub
-        finally:
-            stopped.set()
-            server.join()
+    """A bus in wall time on channel "test"."""
+    with serving("test") as hub:
+        yield hub
