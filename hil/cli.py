@@ -64,18 +64,16 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
     run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
     run.add_argument("--mode", choices=MODES, default="lockstep", help="default lockstep")
-    run.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default out/SCENARIO)")
+    run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
-    run.add_argument(
-        "--log", default=".log", metavar="SUFFIX", help="bus log format: .log .asc .blf .trc ..."
-    )
+    run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .trc ...")
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
     run.add_argument(
         "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
     )
-    run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)")
+    run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
     run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface")
-    run.add_argument("-c", "--channel", metavar="C", help="realtime: its channel; lockstep: for listeners")
+    run.add_argument("-c", "--channel", metavar="C", help="its channel; lockstep: for listeners")
     run.add_argument(
         "--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower"
     )

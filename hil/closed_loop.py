@@ -24,9 +24,8 @@ from plant_sim.equilibrium import initial_state
 from plant_sim.integrator import advance
 from plant_sim.layout import POSITION
 from plant_sim.parameters import PlantParameters
+from plant_sim.period import PERIOD_S, SUBSTEPS
 
-PERIOD_S = 1e-3
-SUBSTEPS = 10
 VELOCITY_LSB_RPM = 0.25
 RAD_S_PER_COUNT = math.pi / 120
 MICROMETRES_PER_METRE = 1e6

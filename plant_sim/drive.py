@@ -9,6 +9,10 @@ once, and the motor follows at its own acceleration limit.
 import math
 from enum import IntEnum
 
+import numpy as np
+
+from dbc.jit import njit
+
 COUNTS_PER_RPM = 4
 """Target velocity is in 0.25 rpm."""
 PERIOD_S = 1e-3
@@ -94,6 +98,65 @@ def decode_controlword(controlword: int) -> Command:
     return _COMMANDS[controlword & 0x0F]
 
 
+# the tables over state and controlword bits 0..3; rows of no state are not used
+_NEXT_STATE = np.zeros((max(State) + 1, 16), np.int64)
+_NEXT_AFTER_RAMP = np.full(max(State) + 1, -1, np.int64)
+for _state in State:
+    for _bits in range(16):
+        _NEXT_STATE[_state, _bits] = _TRANSITIONS.get((_state, decode_controlword(_bits)), _state)
+    _NEXT_AFTER_RAMP[_state] = _AFTER_RAMP.get(_state, -1)
+
+_NOT_READY = int(State.NOT_READY_TO_SWITCH_ON)
+_DISABLED = int(State.SWITCH_ON_DISABLED)
+_ENABLED = int(State.OPERATION_ENABLED)
+_REACTING = int(State.FAULT_REACTION_ACTIVE)
+_FAULT = int(State.FAULT)
+
+# words of a drive
+(
+    STATE,
+    SPEED_COUNTS,  # speed command, 0.25 rpm
+    LIMITED,  # whether the last target was beyond the top speed
+    MISSED,  # periods in a row without a valid command
+    RESET_BIT,  # controlword bit 7 of the last command
+    MAX_COUNTS,  # top speed, 0.25 rpm
+    RAMP_COUNTS,  # slope of a stop, 0.25 rpm per period
+) = range(7)
+DRIVE_SIZE = 7
+
+
+@njit("float64(int64[::1], int64, int64, int64)")
+def drive_step(drive, controlword, target, arrived):  # type: ignore[no-untyped-def]
+    """Run one drive period on a drive's words; see `Drive.step`. `arrived` is 0 without a valid command."""
+    if drive[STATE] == _NOT_READY:
+        drive[STATE] = _DISABLED  # 0, 1
+    if arrived:
+        drive[MISSED] = 0
+        reset_bit = controlword & FAULT_RESET
+        rising = reset_bit > drive[RESET_BIT]
+        drive[RESET_BIT] = reset_bit
+        if drive[STATE] == _FAULT and rising:
+            drive[STATE] = _DISABLED  # 15
+        elif not reset_bit:
+            drive[STATE] = _NEXT_STATE[drive[STATE], controlword & 0x0F]
+    elif drive[STATE] == _ENABLED:
+        drive[MISSED] += 1
+        if drive[MISSED] >= MISSED_COMMANDS_LIMIT:
+            drive[MISSED] = 0
+            drive[STATE] = _REACTING  # 13
+    if _NEXT_AFTER_RAMP[drive[STATE]] >= 0:
+        remaining = max(abs(drive[SPEED_COUNTS]) - drive[RAMP_COUNTS], 0)
+        drive[SPEED_COUNTS] = remaining if drive[SPEED_COUNTS] > 0 else -remaining
+        if remaining == 0:
+            drive[STATE] = _NEXT_AFTER_RAMP[drive[STATE]]
+    elif drive[STATE] != _ENABLED:
+        drive[SPEED_COUNTS] = 0
+    elif arrived:
+        drive[SPEED_COUNTS] = min(max(target, -drive[MAX_COUNTS]), drive[MAX_COUNTS])
+        drive[LIMITED] = drive[SPEED_COUNTS] != target
+    return drive[SPEED_COUNTS] * _RAD_S_PER_COUNT
+
+
 class Drive:
     """The drive's state machine, command supervision and speed command.
 
@@ -110,17 +173,20 @@ class Drive:
 
     Attributes
     ----------
-    state : State
+    words : array of int64, shape (DRIVE_SIZE,)
+        What `drive_step` works on.
     """
 
     def __init__(self, max_speed_rpm: float = 3000.0, deceleration_rad_s2: float = 4000.0) -> None:
-        self._max_counts = int(max_speed_rpm * COUNTS_PER_RPM)
-        self._ramp_counts = max(1, int(deceleration_rad_s2 * PERIOD_S / _RAD_S_PER_COUNT))
-        self.state = State.NOT_READY_TO_SWITCH_ON
-        self._speed_counts = 0
-        self._limited = False
-        self._missed = 0
-        self._reset_bit = 0
+        self.words = np.zeros(DRIVE_SIZE, np.int64)
+        self.words[STATE] = State.NOT_READY_TO_SWITCH_ON
+        self.words[MAX_COUNTS] = int(max_speed_rpm * COUNTS_PER_RPM)
+        self.words[RAMP_COUNTS] = max(1, int(deceleration_rad_s2 * PERIOD_S / _RAD_S_PER_COUNT))
+
+    @property
+    def state(self) -> State:
+        """State of the state machine."""
+        return State(int(self.words[STATE]))
 
     @property
     def statusword(self) -> int:
@@ -128,7 +194,7 @@ class Drive:
         word = self.state | StatusBit.VOLTAGE_ENABLED | StatusBit.REMOTE
         if self.state == State.OPERATION_ENABLED:
             word |= StatusBit.FOLLOWS_COMMAND
-            if self._limited:
+            if self.words[LIMITED]:
                 word |= StatusBit.INTERNAL_LIMIT
         return word
 
@@ -145,42 +211,6 @@ class Drive:
         speed_command_rad_s : float
             For the motor, held until the next step.
         """
-        if self.state == State.NOT_READY_TO_SWITCH_ON:
-            self.state = State.SWITCH_ON_DISABLED  # 0, 1
-        if command is None:
-            self._supervise()
-        else:
-            self._missed = 0
-            self._obey(command[0])
-        self._set_speed(command)
-        return self._speed_counts * _RAD_S_PER_COUNT
-
-    def _supervise(self) -> None:
-        if self.state != State.OPERATION_ENABLED:
-            return
-        self._missed += 1
-        if self._missed >= MISSED_COMMANDS_LIMIT:
-            self._missed = 0
-            self.state = State.FAULT_REACTION_ACTIVE  # 13
-
-    def _obey(self, controlword: int) -> None:
-        reset_bit = controlword & FAULT_RESET
-        rising = reset_bit > self._reset_bit
-        self._reset_bit = reset_bit
-        if self.state == State.FAULT and rising:
-            self.state = State.SWITCH_ON_DISABLED  # 15
-        elif not reset_bit:
-            self.state = _TRANSITIONS.get((self.state, decode_controlword(controlword)), self.state)
-
-    def _set_speed(self, command: tuple[int, int] | None) -> None:
-        if self.state in _AFTER_RAMP:
-            remaining = max(abs(self._speed_counts) - self._ramp_counts, 0)
-            self._speed_counts = remaining if self._speed_counts > 0 else -remaining
-            if remaining == 0:
-                self.state = _AFTER_RAMP[self.state]
-        elif self.state != State.OPERATION_ENABLED:
-            self._speed_counts = 0
-        elif command is not None:
-            target = command[1]
-            self._speed_counts = min(max(target, -self._max_counts), self._max_counts)
-            self._limited = self._speed_counts != target
+        controlword, target = command or (0, 0)
+        speed_rad_s: float = drive_step(self.words, controlword, target, command is not None)
+        return speed_rad_s

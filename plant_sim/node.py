@@ -2,22 +2,29 @@
 
 import math
 
+import numpy as np
+
+from dbc import e2e
 from dbc.contract import Contract
-from dbc.e2e import ACCEPTED
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from plant_sim.drive import COUNTS_PER_RPM, Drive
 from plant_sim.equilibrium import initial_state
-from plant_sim.hydraulics import accumulator_pressure
-from plant_sim.integrator import advance
 from plant_sim.parameters import PlantParameters
+from plant_sim.period import (
+    COLUMNS,
+    LOAD,
+    MOTOR_SPEED,
+    POSITION,
+    PRESSURE_A,
+    PRESSURE_ACCUMULATOR,
+    expectation,
+    run_period,
+)
 from plant_sim.sensors import PositionSensor, pressure_count
 
-SUBSTEPS = 10
-
-_PERIOD_S = PERIOD_NS * 1e-9
 _STATUS_PERIODS = 10
 _STATUS_PHASE = 2
 _PRESSURE_PHASE = 4
@@ -56,7 +63,6 @@ class Plant:
         self._contract = contract
         self._parameters = parameters
         self._vector = parameters.vector()
-        self._vector_list: list[float] = self._vector.tolist()
         self._sensor = sensor or PositionSensor()
         self.accepts = frozenset(
             message.can_id
@@ -68,33 +74,18 @@ class Plant:
             message.can_id
             for message in (contract.position_feedback, contract.drive_status, contract.pressure_feedback)
         )
-        self.record = Record(
-            (
-                "time_ns",
-                "position_m",
-                "velocity_m_s",
-                "pressure_a_pa",
-                "pressure_b_pa",
-                "pressure_accumulator_pa",
-                "motor_speed_rad_s",
-                "speed_command_rad_s",
-                "load_n",
-                "drive_state",
-            ),
-            "d",
-        )
+        self._expected = expectation(contract.drive_command)
+        self.record = Record(("time_ns", *COLUMNS), "d")
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: at rest, retracted, drive off."""
         contract = self._contract
-        self._check = contract.drive_command.checker().check
+        self._receiver = np.zeros(e2e.STATE_SIZE, np.int64)
         self._protect_position = contract.position_feedback.protector().protect
         self._protect_status = contract.drive_status.protector().protect
         self._command_frame: Frame | None = None
         self._bench_frames: dict[int, Frame] = {}
         self._time_ns = next_period(now_ns)
-        self._speed_command_rad_s = 0.0
-        self._load_n = 0.0
         self._restart(0.0)
         return Actions(self._time_ns)
 
@@ -111,49 +102,43 @@ class Plant:
         contract = self._contract
         if self._bench_frames:
             self._take_bench_frames()
-        state = self._state
-        while self._time_ns + PERIOD_NS <= now_ns:
-            advance(state, self._vector, self._speed_command_rad_s, self._load_n, _PERIOD_S, SUBSTEPS)
-            self._time_ns += PERIOD_NS
-        position_m, velocity_m_s, pressure_a_pa, pressure_b_pa, speed_rad_s, oil_m3 = state.tolist()
-        accumulator_pa = accumulator_pressure(oil_m3, self._vector_list)
+        periods = (now_ns - self._time_ns) // PERIOD_NS
+        self._time_ns += periods * PERIOD_NS
+        frame, self._command_frame = self._command_frame, None
+        arrived = frame is not None and frame.dlc == contract.drive_command.dlc
+        run_period(
+            self._state,
+            self._vector,
+            self._row,
+            periods,
+            self._drive.words,
+            self._receiver,
+            self._expected,
+            frame.data if frame is not None else 0,
+            arrived,
+        )
+        row = self._row.tolist()
+        self.record.append((self._time_ns, *row))
 
         feedback = contract.position_feedback
-        payload = self._protect_position(feedback.pack(_SENSOR_OK, self._sensor.read(position_m)))
+        payload = self._protect_position(feedback.pack(_SENSOR_OK, self._sensor.read(row[POSITION])))
         sends = [(now_ns, feedback.frame(payload))]
-
-        self._speed_command_rad_s = self._drive.step(self._drive_command())
         phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
         if phase == _STATUS_PHASE:
             status = contract.drive_status
-            counts = round(speed_rad_s * _COUNTS_PER_RAD_S)
+            counts = round(row[MOTOR_SPEED] * _COUNTS_PER_RAD_S)
             payload = self._protect_status(status.pack(self._drive.statusword, counts))
             sends.append((now_ns, status.frame(payload)))
         elif phase == _PRESSURE_PHASE:
             pressure = contract.pressure_feedback
-            counts3 = (pressure_count(pa) for pa in (pressure_a_pa, pressure_b_pa, accumulator_pa))
+            counts3 = map(pressure_count, row[PRESSURE_A : PRESSURE_ACCUMULATOR + 1])
             sends.append((now_ns, pressure.frame(pressure.pack(*counts3))))
-        self.record.append(
-            (
-                self._time_ns,
-                position_m,
-                velocity_m_s,
-                pressure_a_pa,
-                pressure_b_pa,
-                accumulator_pa,
-                speed_rad_s,
-                self._speed_command_rad_s,
-                self._load_n,
-                self._drive.state,
-            )
-        )
         return Actions(self._time_ns + PERIOD_NS, tuple(sends))
 
     def _restart(self, position_m: float) -> None:
         self._state = initial_state(self._parameters, position_m)
         self._drive = Drive(self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2)
-        self._speed_command_rad_s = 0.0
-        self._load_n = 0.0
+        self._row = np.zeros(len(COLUMNS))
 
     def _take_bench_frames(self) -> None:
         contract = self._contract
@@ -166,16 +151,5 @@ class Plant:
         frame = self._bench_frames.pop(contract.bench_load.can_id, None)
         if frame is not None:
             force_n = float(contract.bench_load.unpack(frame.data).force)
-            self._load_n = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
-            self.record.amend("load_n", self._load_n)  # it acts in all of the period that now ends
-
-    def _drive_command(self) -> tuple[int, int] | None:
-        message = self._contract.drive_command
-        frame, self._command_frame = self._command_frame, None
-        if frame is None or frame.dlc != message.dlc:
-            self._check(None)
-            return None
-        if self._check(frame.data) not in ACCEPTED:
-            return None
-        command = message.unpack(frame.data)
-        return command.controlword, command.target_velocity
+            self._row[LOAD] = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
+            self.record.amend("load_n", self._row[LOAD])  # it acts in all of the period that now ends

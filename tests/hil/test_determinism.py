@@ -77,9 +77,7 @@ def test_at_any_bit_rate_too(tmp_path, bit_rate):
     [(nullcontext, "0"), (nullcontext, "1234"), (busy_machine, "random")],
     ids=["seed 0", "seed 1234", "busy"],
 )
-def test_neither_hash_seed_nor_load_changes_a_lockstep_run(
-    tmp_path, monkeypatch, machine, hash_seed, hashes
-):
+def test_neither_hash_seed_nor_load_changes_a_lockstep_run(tmp_path, monkeypatch, machine, hash_seed, hashes):
     monkeypatch.setenv("PYTHONHASHSEED", hash_seed)
     with machine():
         assert sha256(run_lockstep(options(tmp_path))) == hashes(SINE)
@@ -100,9 +98,7 @@ def test_the_hash_seed_does_not_change_a_run_in_one_process(tmp_path):
 # observers and intruders
 
 
-def with_program(
-    given: RunOptions, program: Callable[[can.BusABC, threading.Event], None]
-) -> Recording:
+def with_program(given: RunOptions, program: Callable[[can.BusABC, threading.Event], None]) -> Recording:
     """Run in lock-step with a python-can program attached from a thread.
 
     The run starts when the program has attached, and its bus is closed after the run.

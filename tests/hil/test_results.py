@@ -230,7 +230,9 @@ def test_without_limits_there_are_none_to_miss(tmp_path):
 def test_the_list_names_every_scenario(capsys):
     assert cli.main(["list"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in ("sine", "sine_load", "lift_lower", "lift_lower_load", "full_stroke"))
+    assert all(
+        name in listed for name in ("sine", "sine_load", "lift_lower", "lift_lower_load", "full_stroke")
+    )
 
 
 @pytest.mark.parametrize(

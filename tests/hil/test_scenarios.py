@@ -176,16 +176,19 @@ def test_every_message_keeps_its_cycle_time():
     for message in CONTRACT.messages:
         if message.bench_channel:
             continue
-        ends_ns = ends_of("sine", {
-            "DriveCommand": "drive_command",
-            "PositionFeedback": "position_feedback",
-            "PositionSetpoint": "position_setpoint",
-            "ControllerCommand": "controller_command",
-            "DriveStatus": "drive_status",
-            "PressureFeedback": "pressure_feedback",
-            "ControllerStatus": "controller_status",
-            "ObserverState": "observer_state",
-        }[message.name])
+        ends_ns = ends_of(
+            "sine",
+            {
+                "DriveCommand": "drive_command",
+                "PositionFeedback": "position_feedback",
+                "PositionSetpoint": "position_setpoint",
+                "ControllerCommand": "controller_command",
+                "DriveStatus": "drive_status",
+                "PressureFeedback": "pressure_feedback",
+                "ControllerStatus": "controller_status",
+                "ObserverState": "observer_state",
+            }[message.name],
+        )
         cycle = np.median(np.diff(ends_ns))
         assert cycle == pytest.approx(message.cycle_time_ns, rel=0.01), message.name
 

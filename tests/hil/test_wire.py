@@ -286,9 +286,7 @@ def test_an_out_of_band_frame_arrives_at_once_on_a_busy_bus_and_takes_no_bus_tim
 def test_an_out_of_band_frame_comes_after_the_timers_of_its_instant():
     diary = []
     bench = Talker("bench", [(5_000, LOAD)])
-    wire_of(
-        bench, Talker("plant", timer_ns=5_000, diary=diary), out_of_band=OUT_OF_BAND
-    ).run(10_000)
+    wire_of(bench, Talker("plant", timer_ns=5_000, diary=diary), out_of_band=OUT_OF_BAND).run(10_000)
     assert [what for _, what, _ in diary] == ["timer", "frame"]
 
 

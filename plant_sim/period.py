@@ -1,0 +1,92 @@
+"""One period of drive and plant, compiled."""
+
+import numpy as np
+
+from dbc import e2e
+from dbc.codec import MessageCodec
+from dbc.jit import njit
+from dbc.messages import DriveCommand
+from dbc.node import PERIOD_NS
+from plant_sim import layout as at
+from plant_sim.drive import STATE, drive_step
+from plant_sim.hydraulics import accumulator_pressure
+from plant_sim.integrator import advance
+
+SUBSTEPS = 10
+PERIOD_S = PERIOD_NS * 1e-9
+
+COLUMNS = (
+    "position_m",
+    "velocity_m_s",
+    "pressure_a_pa",
+    "pressure_b_pa",
+    "pressure_accumulator_pa",
+    "motor_speed_rad_s",
+    "speed_command_rad_s",
+    "load_n",
+    "drive_state",
+)
+(
+    POSITION,
+    VELOCITY,
+    PRESSURE_A,
+    PRESSURE_B,
+    PRESSURE_ACCUMULATOR,
+    MOTOR_SPEED,
+    SPEED_COMMAND,  # held by the drive until the next period
+    LOAD,  # set by the caller
+    DRIVE_STATE,
+) = range(9)
+"""Indices of a row: the state at its period's start, and what acts during it."""
+
+# what the drive expects of DriveCommand: the receiver's E2E configuration, then where its signals lie
+_CONTROLWORD_START = e2e.CONFIGURATION_SIZE
+_TARGET_START = e2e.CONFIGURATION_SIZE + 1
+_ACCEPTED = (int(e2e.Status.OK), int(e2e.Status.OKSOMELOST), int(e2e.Status.SYNC))
+
+
+def expectation(message: MessageCodec[..., DriveCommand]) -> np.ndarray:
+    """Return what `run_period` needs to know of DriveCommand."""
+    controlword, target_velocity = message.fields
+    return np.array([*message.receiver_configuration(), controlword.start, target_velocity.start], np.int64)
+
+
+@njit(
+    "void(float64[::1], float64[::1], float64[::1], int64,"
+    " int64[::1], int64[::1], int64[::1], uint64, int64)",
+    depends=("dbc.e2e", "plant_sim"),
+)
+def run_period(state, parameters, row, periods, drive, receiver, expected, data, arrived):  # type: ignore[no-untyped-def]
+    """Advance the plant, then let the drive take its newest command.
+
+    Parameters
+    ----------
+    state, parameters : array of float64
+        See `plant_sim.layout`.
+    row : array of float64, shape (len(COLUMNS),)
+        The last period's row on entry, this one's on return.
+    periods : int
+        Periods to advance with what acted in the last one.
+    drive : array of int64
+        See `plant_sim.drive`.
+    receiver : array of int64, shape (e2e.STATE_SIZE,)
+        E2E state of DriveCommand.
+    expected : array of int64
+        From `expectation`.
+    data, arrived : int
+        Payload of the newest DriveCommand; 0 if none arrived since the last call.
+    """
+    for _ in range(periods):
+        advance(state, parameters, row[SPEED_COMMAND], row[LOAD], PERIOD_S, SUBSTEPS)
+    row[POSITION] = state[at.POSITION]
+    row[VELOCITY] = state[at.VELOCITY]
+    row[PRESSURE_A] = state[at.PRESSURE_A]
+    row[PRESSURE_B] = state[at.PRESSURE_B]
+    row[PRESSURE_ACCUMULATOR] = accumulator_pressure(state[at.OIL_VOLUME], parameters)
+    row[MOTOR_SPEED] = state[at.MOTOR_SPEED]
+    status = e2e.profile2_check(receiver, expected[: e2e.CONFIGURATION_SIZE], data, arrived)
+    payload = np.int64(data)
+    controlword = (payload >> expected[_CONTROLWORD_START]) & 0xFFFF
+    target = (((payload >> expected[_TARGET_START]) & 0xFFFF) ^ 0x8000) - 0x8000
+    row[SPEED_COMMAND] = drive_step(drive, controlword, target, status in _ACCEPTED)
+    row[DRIVE_STATE] = drive[STATE]
