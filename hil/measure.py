@@ -85,7 +85,8 @@ def result_of(
     """
     scenario = options.scenario
     error_mm = trace.get("error_m", np.full(1, np.nan)) * M_TO_MM
-    speed_rpm = trace.get("target_velocity_rpm", np.full(2, np.nan))
+    speed_steps_rpm = np.diff(trace.get("target_velocity_rpm", np.full(1, np.nan)))
+    speed_steps_rpm = speed_steps_rpm[np.isfinite(speed_steps_rpm)]
     rms_mm = _finite(np.sqrt(np.nanmean(error_mm**2))) if np.isfinite(error_mm).any() else None
     max_mm = _finite(np.nanmax(np.abs(error_mm))) if np.isfinite(error_mm).any() else None
     limits = scenario.limits.get(options.controller)
@@ -101,8 +102,8 @@ def result_of(
         "ending": recording.ending,
         "rms_mm": rms_mm,
         "max_mm": max_mm,
-        "chatter_rpm_per_period": _finite(np.sqrt(np.nanmean(np.diff(speed_rpm) ** 2)))
-        if len(speed_rpm) > 1
+        "chatter_rpm_per_period": float(np.sqrt(np.mean(speed_steps_rpm**2)))
+        if speed_steps_rpm.size
         else None,
         "limits": limits,
         "within_limits": within,

@@ -114,7 +114,8 @@ def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
     disturbance.set_xlabel("time / s")
     for axis in axes:
         axis.grid(alpha=0.3)
-        axis.legend(loc="upper right", fontsize="small")
+        if axis.lines:
+            axis.legend(loc="upper right", fontsize="small")
         axis.margins(x=0.01)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

@@ -91,7 +91,7 @@ class Wire:
         self._routes: dict[int, list[Port]] = {}
         self._keys: dict[int, int] = {}
         self._released: list[tuple[int, int, Port, Frame]] = []
-        self._pending: list[tuple[int, int, int, Port, Frame]] = []
+        self._pending: list[tuple[int, int, int, int, Port, Frame]] = []
         self._sequence = 0
         self._on_wire: tuple[Port, Frame] | None = None
         self._end_ns = NEVER
@@ -120,7 +120,7 @@ class Wire:
         self._wakes[port.order] = NEVER
         self._routes.clear()
         self._released[:] = sorted(entry for entry in self._released if entry[2] is not port)
-        self._pending[:] = sorted(entry for entry in self._pending if entry[3] is not port)
+        self._pending[:] = sorted(entry for entry in self._pending if entry[4] is not port)
 
     def start(self, port: Port) -> None:
         """Power a node on now."""
@@ -128,11 +128,12 @@ class Wire:
 
     def send(self, port: Port, ready_ns: int, frame: Frame) -> None:
         """Hand a frame to the port's CAN controller at bus time `ready_ns`, now or later."""
-        if ready_ns > self.now_ns or frame.can_id in self._out_of_band:
-            self._sequence += 1
-            heappush(self._released, (max(ready_ns, self.now_ns), self._sequence, port, frame))
+        self._sequence += 1
+        now_ns = self.now_ns
+        if ready_ns > now_ns or frame.can_id in self._out_of_band:
+            heappush(self._released, (max(ready_ns, now_ns), self._sequence, port, frame))
         else:
-            self._queue(port, frame)
+            self._queue(now_ns, self._sequence, port, frame)
 
     def next_event_ns(self) -> int:
         """Return the bus time of the next event, `NEVER` if there is none."""
@@ -142,22 +143,29 @@ class Wire:
 
     def run(self, until_ns: int) -> None:
         """Process every event before bus time `until_ns`."""
-        wakes, released, pending = self._wakes, self._released, self._pending
+        wakes, released, pending = self._wakes or [NEVER], self._released, self._pending
         while True:
-            event_ns, step = self._end_ns, self._finish_frame
-            wake_ns = min(wakes, default=NEVER)
-            if wake_ns < event_ns:
-                event_ns, step = wake_ns, self._wake
-            if released and released[0][0] < event_ns:
-                event_ns, step = released[0][0], self._release
-            if pending and self._on_wire is None:
-                arbitration_ns = max(self._idle_ns, self.now_ns)
+            end_ns, wake_ns = self._end_ns, min(wakes)
+            event_ns = end_ns if end_ns <= wake_ns else wake_ns
+            release_ns = released[0][0] if released else NEVER
+            if release_ns < event_ns:
+                event_ns = release_ns
+            arbitration_ns = NEVER
+            if pending and end_ns == NEVER:
+                arbitration_ns = self._idle_ns if self._idle_ns > self.now_ns else self.now_ns
                 if arbitration_ns < event_ns:
-                    event_ns, step = arbitration_ns, self._arbitrate
+                    event_ns = arbitration_ns
             if event_ns >= until_ns:
                 break
             self.now_ns = event_ns
-            step()
+            if event_ns == end_ns:
+                self._finish_frame()
+            elif event_ns == wake_ns:
+                self._wake()
+            elif event_ns == release_ns:
+                self._release()
+            else:
+                self._arbitrate()
         self.now_ns = max(self.now_ns, until_ns)
 
     def _wake(self) -> None:
@@ -178,22 +186,21 @@ class Wire:
             self.send(port, send_ns if on_bus_time else to_bus(send_ns), frame)
 
     def _release(self) -> None:
-        _, _, port, frame = heappop(self._released)
+        ready_ns, sequence, port, frame = heappop(self._released)
         if frame.can_id in self._out_of_band:
             self._deliver(port, frame)
         else:
-            self._queue(port, frame)
+            self._queue(ready_ns, sequence, port, frame)
 
-    def _queue(self, port: Port, frame: Frame) -> None:
+    def _queue(self, ready_ns: int, sequence: int, port: Port, frame: Frame) -> None:
         can_id = frame.can_id
         key = self._keys.get(can_id)
         if key is None:
             key = self._keys[can_id] = arbitration_key(can_id)
-        self._sequence += 1
-        heappush(self._pending, (key, port.order, self._sequence, port, frame))
+        heappush(self._pending, (key, port.order, ready_ns, sequence, port, frame))
 
     def _arbitrate(self) -> None:
-        _, _, _, port, frame = heappop(self._pending)
+        *_, port, frame = heappop(self._pending)
         bits = classic_bits(*frame)
         start_ns = self.now_ns
         self._on_wire = port, frame

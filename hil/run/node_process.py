@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import can
 
@@ -79,7 +79,7 @@ def node_main(
     try:
         node = build(arguments)
         if arguments.interface == "hilbus" and arguments.channel:
-            connection, answer = link.connect(arguments.channel, _hello(node))
+            connection, answer = _attach(arguments.channel, node)
             if answer["virtual"]:
                 serve(node, connection, arguments.channel)
             else:
@@ -134,6 +134,13 @@ def serve(node: Node, connection: socket.socket, channel: str) -> None:
             elif kind == link.START:
                 actions = node.on_start(now_ns)
             connection.send(link.pack_actions(actions))
+
+
+def _attach(channel: str, node: Node) -> tuple[socket.socket, dict[str, Any]]:
+    try:
+        return link.connect(channel, _hello(node))
+    except LinkError as error:
+        raise can.CanInitializationError(str(error)) from error
 
 
 def _hello(node: Node) -> dict[str, object]:

@@ -11,13 +11,15 @@ import pytest
 import firmware_py.mailbox
 import firmware_py.node
 import firmware_py.state_machine
+import firmware_py.task
 from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING
 from firmware_py.kernel.layout import LAW_ADRC, LAW_PI
-from firmware_py.node import EXECUTION_NS, Controller, Fault
+from firmware_py.node import EXECUTION_NS, Controller
 from firmware_py.state_machine import State
+from firmware_py.task import Fault
 from firmware_py.tuning import Tuning
 
 CONTRACT = Contract.load()
@@ -551,6 +553,9 @@ def test_limited_periods_are_counted(running):
 # integers only
 
 
+SOURCES = (firmware_py.node, firmware_py.task, firmware_py.mailbox, firmware_py.state_machine)
+
+
 def test_all_it_sends_is_made_of_plain_integers(running):
     set_inputs(running, setpoint_0p1um=10 * POSITION_UM + 1000)
     for _ in range(110):
@@ -561,9 +566,7 @@ def test_all_it_sends_is_made_of_plain_integers(running):
     assert {column.dtype.kind for column in record.values()} == {"i"}
 
 
-@pytest.mark.parametrize(
-    "module", [firmware_py.node, firmware_py.mailbox, firmware_py.state_machine], ids=lambda m: m.__name__
-)
+@pytest.mark.parametrize("module", SOURCES, ids=lambda m: m.__name__)
 def test_the_sources_know_no_floats(module):
     for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
         assert not (isinstance(node, ast.Constant) and isinstance(node.value, float | complex))

@@ -1,15 +1,57 @@
 """Receive mailboxes: the newest valid frame, why one was refused, and how long none came."""
 
+from typing import Any
+
 import pytest
 
+from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from dbc.frame import Frame
-from firmware_py.mailbox import Mailbox
+from firmware_py import mailbox as rows
 
 CONTRACT = Contract.load()
 FEEDBACK = CONTRACT.position_feedback
 COMMAND = CONTRACT.controller_command
 SENSOR_OK, SENSOR_BROKEN = 0, 3
+
+
+class Mailbox:
+    """One row of the controller's mailboxes."""
+
+    def __init__(self, message: MessageCodec[..., Any] = FEEDBACK, **plausible: tuple[int, int]) -> None:
+        self._expected = rows.expectation(message, plausible)
+        (self._row,) = rows.empty(self._expected.reshape(1, -1))
+
+    def period(self, *frames: Frame | None) -> None:
+        """Receive frames, then poll."""
+        for frame in frames:
+            if frame is not None:
+                rows.receive(self._row, frame.data, frame.dlc)
+        rows.poll(self._row, self._expected)
+
+    @property
+    def position(self) -> int:
+        return int(self._row[rows.VALUES + 1])
+
+    @property
+    def is_new(self) -> bool:
+        return bool(self._row[rows.IS_NEW])
+
+    @property
+    def stale(self) -> bool:
+        return bool(self._row[rows.STALE])
+
+    @property
+    def corrupt(self) -> bool:
+        return bool(self._row[rows.CORRUPT])
+
+    @property
+    def invalid(self) -> bool:
+        return bool(self._row[rows.INVALID])
+
+    @property
+    def overruns(self) -> int:
+        return int(self._row[rows.OVERRUNS])
 
 
 class Sender:
@@ -61,85 +103,80 @@ def sender() -> Sender:
 @pytest.fixture
 def mailbox(sender: Sender) -> Mailbox:
     """A mailbox that has just received a valid frame, position 2."""
-    mailbox = Mailbox(FEEDBACK, lambda value: value.sensor_status == SENSOR_OK)
+    mailbox = Mailbox(sensor_status=(SENSOR_OK, SENSOR_OK), position=(0, 1000))
     for _ in range(2):
-        period(mailbox, sender.good())
+        mailbox.period(sender.good())
     assert not mailbox.stale
     return mailbox
 
 
-def period(mailbox: Mailbox, frame: Frame | None) -> None:
-    if frame is not None:
-        mailbox.receive(frame)
-    mailbox.poll()
-
-
 def test_it_is_stale_until_the_first_valid_frame():
-    mailbox = Mailbox(FEEDBACK)
-    assert (mailbox.stale, mailbox.value) == (True, None)
-    mailbox.poll()
-    assert (mailbox.stale, mailbox.value) == (True, None)
+    mailbox = Mailbox()
+    assert mailbox.stale
+    for _ in range(10):
+        mailbox.period()
+        assert (mailbox.stale, mailbox.is_new) == (True, False)
 
 
 def test_the_very_first_frame_only_tells_where_the_counter_stands(sender):
-    mailbox = Mailbox(FEEDBACK)
-    period(mailbox, sender.good())
-    assert (mailbox.stale, mailbox.value, mailbox.corrupt) == (True, None, False)
-    period(mailbox, sender.good())
-    assert (mailbox.stale, mailbox.value.position, mailbox.is_new) == (False, 2, True)
+    mailbox = Mailbox()
+    mailbox.period(sender.good())
+    assert (mailbox.stale, mailbox.is_new, mailbox.corrupt) == (True, False, False)
+    mailbox.period(sender.good())
+    assert (mailbox.stale, mailbox.position, mailbox.is_new) == (False, 2, True)
 
 
 def test_between_frames_the_value_stays_but_is_not_new(mailbox):
-    period(mailbox, None)
-    assert (mailbox.value.position, mailbox.is_new) == (2, False)
+    mailbox.period(None)
+    assert (mailbox.position, mailbox.is_new) == (2, False)
 
 
 @pytest.mark.parametrize("bad", BAD)
 def test_a_bad_frame_does_not_touch_the_value(mailbox, sender, bad):
-    period(mailbox, getattr(sender, bad)())
-    assert (mailbox.value.position, mailbox.is_new) == (2, False)
+    mailbox.period(getattr(sender, bad)())
+    assert (mailbox.position, mailbox.is_new) == (2, False)
 
 
 @pytest.mark.parametrize("bad", BAD)
 def test_two_bad_periods_are_forgiven(mailbox, sender, bad):
     for _ in range(2):
-        period(mailbox, getattr(sender, bad)())
+        mailbox.period(getattr(sender, bad)())
         assert not mailbox.stale
-    period(mailbox, sender.good())
+    mailbox.period(sender.good())
     assert (mailbox.is_new, mailbox.stale, mailbox.corrupt, mailbox.invalid) == (True, False, False, False)
 
 
 @pytest.mark.parametrize("bad", [*BAD, "out_of_sequence"])
 def test_the_third_bad_period_makes_it_stale(mailbox, sender, bad):
     for expected in (False, False, True, True):
-        period(mailbox, getattr(sender, bad)())
+        mailbox.period(getattr(sender, bad)())
         assert mailbox.stale is expected
 
 
 def test_any_three_bad_periods_make_it_stale(mailbox, sender):
     for bad in ("missing", "wrong_crc", "implausible"):
-        period(mailbox, getattr(sender, bad)())
+        mailbox.period(getattr(sender, bad)())
     assert mailbox.stale
 
 
 def test_a_jump_of_the_counter_costs_one_frame(mailbox, sender):
-    period(mailbox, sender.out_of_sequence())
+    mailbox.period(sender.out_of_sequence())
     assert (mailbox.is_new, mailbox.corrupt) == (False, True)
-    period(mailbox, sender.good())
+    mailbox.period(sender.good())
     assert (mailbox.is_new, mailbox.corrupt) == (True, False)
 
 
 def test_one_lost_frame_costs_nothing_more(mailbox, sender):
     sender.good()
-    period(mailbox, sender.good())
+    mailbox.period(sender.good())
     assert mailbox.is_new
 
 
 def test_valid_frames_end_staleness(mailbox, sender):
     for _ in range(50):
-        period(mailbox, None)
+        mailbox.period(None)
     for _ in range(2):  # the first one only synchronises the counter again
-        period(mailbox, sender.good())
+        mailbox.period(sender.good())
     assert not mailbox.stale
 
 
@@ -155,26 +192,35 @@ def test_valid_frames_end_staleness(mailbox, sender):
     ],
 )
 def test_it_says_why(mailbox, sender, bad, corrupt, invalid):
-    period(mailbox, getattr(sender, bad)())
+    mailbox.period(getattr(sender, bad)())
     assert (mailbox.corrupt, mailbox.invalid) == (corrupt, invalid)
 
 
 def test_the_newest_frame_counts_and_overwritten_ones_are_counted(mailbox, sender):
-    for _ in range(3):
-        mailbox.receive(sender.good())
-    mailbox.poll()
+    mailbox.period(sender.good(), sender.good(), sender.good())
     assert mailbox.overruns == 2
-    period(mailbox, sender.good())
-    assert (mailbox.overruns, mailbox.value.position) == (2, 6)
+    mailbox.period(sender.good())
+    assert (mailbox.overruns, mailbox.position) == (2, 6)
+
+
+def test_signed_signals_and_the_ends_of_the_plausible_range(sender):
+    mailbox, protect = Mailbox(position=(-500, 1000)), FEEDBACK.protector().protect
+    expected = [(-501, False), (-500, True), (1000, True), (1001, False), (-1, True), (-(2**31), False)]
+    mailbox.period(FEEDBACK.frame(protect(FEEDBACK.pack(0, 0))))
+    for position, plausible in expected:
+        mailbox.period(FEEDBACK.frame(protect(FEEDBACK.pack(0, position))))
+        assert (mailbox.is_new, mailbox.invalid) == (plausible, not plausible)
+        if plausible:
+            assert mailbox.position == position
 
 
 def test_a_message_of_100_ms_is_stale_after_300():
     mailbox, protector = Mailbox(COMMAND), COMMAND.protector()
     for number in range(301):
         due = number % 100 == 0
-        period(mailbox, COMMAND.frame(protector.protect(COMMAND.pack(1, 3, 0))) if due else None)
+        mailbox.period(COMMAND.frame(protector.protect(COMMAND.pack(1, 3, 0))) if due else None)
     for _ in range(299):
-        period(mailbox, None)
+        mailbox.period(None)
         assert not mailbox.stale
-    period(mailbox, None)
+    mailbox.period(None)
     assert mailbox.stale

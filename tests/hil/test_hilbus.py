@@ -5,6 +5,7 @@ import select
 import socket
 import stat
 import time
+from itertools import pairwise
 
 import can
 import pytest
@@ -50,9 +51,8 @@ def test_identifiers_and_data_arrive_as_sent(hub, can_id, extended, data):
     sent = message(can_id, data, extended)
     with open_bus() as sender, open_bus() as receiver:
         sender.send(sent)
-        assert receiver.recv(SAFETY_NET_S).equals(
-            sent, timestamp_delta=None, check_direction=False, check_channel=False
-        )
+        received = receiver.recv(SAFETY_NET_S)
+        assert received.equals(sent, timestamp_delta=None, check_direction=False, check_channel=False)
 
 
 def test_many_frames_of_one_sender_keep_their_order_and_none_is_lost(hub):
@@ -71,9 +71,7 @@ def test_timestamps_are_bus_time_and_a_burst_takes_its_time_on_the_wire(hub):
         stamps_s = [receiver.recv(SAFETY_NET_S).timestamp for _ in range(10)]
     assert 0.0 < stamps_s[0] < SAFETY_NET_S
     shortest_s = frame_bits(message()) * 1e-6
-    assert all(
-        later - earlier >= shortest_s - 1e-9 for earlier, later in zip(stamps_s, stamps_s[1:], strict=False)
-    )
+    assert all(later - earlier >= shortest_s - 1e-9 for earlier, later in pairwise(stamps_s))
 
 
 def test_filters_keep_other_frames_out(hub):
@@ -330,5 +328,5 @@ def test_bus_time_in_wall_time_does_not_run_ahead(hub):
         time.sleep(0.05)
         sender.send(message())
         second_s = receiver.recv(SAFETY_NET_S).timestamp
-    assert 0.05 <= second_s - first_s + 0.001
+    assert second_s - first_s >= 0.049
     assert second_s - first_s <= time.monotonic() - begin_s
