@@ -83,6 +83,24 @@ _OKSOMELOST = int(Status.OKSOMELOST)
 _WRONGSEQUENCE = int(Status.WRONGSEQUENCE)
 
 
+@njit("uint64(int64[::1], int64[::1], uint64)")
+def profile2_protect(counter, configuration, data):  # type: ignore[no-untyped-def]
+    """``E2E_P02Protect``: return the payload with the next counter and the CRC filled in.
+
+    Parameters
+    ----------
+    counter : array of int64, shape (1,)
+        The counter last sent, updated in place; 0 at power-on.
+    configuration : array of int64, shape (CONFIGURATION_SIZE,)
+        As from `receiver_configuration`: DataIDs and length are those of the sender, too.
+    data : int
+        Payload as an unsigned integer, byte 0 in the low eight bits.
+    """
+    counter[0] = (counter[0] + 1) & MAX_COUNTER
+    payload = (data & ~np.uint64(0xFFF)) | np.uint64(counter[0] << 8)
+    return payload | np.uint64(profile2_crc(payload, configuration[DLC], configuration[counter[0]]))
+
+
 @njit("int64(int64[::1], int64[::1], uint64, int64)")
 def profile2_check(state, configuration, data, arrived):  # type: ignore[no-untyped-def]
     """``E2E_P02Check``: return the status of one received payload.
@@ -179,19 +197,16 @@ class Protector:
         Payload length in bytes, 2..8.
     """
 
-    __slots__ = ("_counter", "_data_ids", "_dlc")
+    __slots__ = ("_configuration", "_state")
 
     def __init__(self, data_ids: Sequence[int], dlc: int) -> None:
-        self._data_ids = _checked_data_ids(data_ids)
-        self._dlc = dlc
-        self._counter = 0
+        self._configuration = receiver_configuration(data_ids, dlc)
+        self._state = np.zeros(1, np.int64)
 
     def protect(self, data: int) -> int:
         """Return `data` with the next counter and the CRC filled in; the first counter sent is 1."""
-        counter = self._counter = (self._counter + 1) & MAX_COUNTER
-        data = data & ~0xFFF | counter << 8
-        crc: int = profile2_crc(data, self._dlc, self._data_ids[counter])
-        return data | crc
+        protected: int = profile2_protect(self._state, self._configuration, data)
+        return protected
 
 
 class Checker:

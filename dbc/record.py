@@ -24,6 +24,10 @@ class Record:
         self._cells: array[Any] = array(typecode)
         self.append: Callable[[tuple[float, ...]], None] = self._cells.extend
 
+    def append_array(self, row: np.ndarray) -> None:
+        """Append a row of the record's own type."""
+        self._cells.frombytes(row.tobytes())
+
     def amend(self, column: str, value: float) -> None:
         """Change a cell of the last row; do nothing before the first one."""
         if self._cells:

@@ -71,31 +71,14 @@ class Controller:
             message.can_id
             for message in (contract.drive_command, contract.controller_status, contract.observer_state)
         )
-        self.record = Record(
-            (
-                "time_ns",
-                "state",
-                "faults",
-                "setpoint_0p1um",
-                "position_um",
-                "target_velocity_0p25rpm",
-                "flags",
-                "v1",
-                "v2",
-                "v3",
-                "z1",
-                "z2",
-                "z3",
-                "z4",
-            ),
-            "q",
-        )
+        self._layout = task.command_layout(contract.drive_command)
+        self._row = np.zeros(len(task.RECORD_COLUMNS), np.int64)
+        self.record = Record(task.RECORD_COLUMNS, "q")
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on or reset: forget everything, check the calibration."""
         self._mailboxes = mailbox.empty(self._expectations)
         self._rows = dict(zip(self._received_ids, self._mailboxes, strict=True))
-        self._protect = self._drive_command.protector().protect
         self._task = np.zeros(task.TASK_SIZE, np.int64)
         self._kernel_state = np.zeros(k.ST_SIZE, np.int32)
         self._io = np.zeros(k.IO_SIZE, np.int32)
@@ -124,19 +107,24 @@ class Controller:
         """Timer interrupt: one control period."""
         if self._bench_reset:
             self.on_start(now_ns)
-        task.period(
-            self._mailboxes, self._expectations, self._task, self._calibration, self._kernel_state, self._io
+        payload = task.period(
+            self._mailboxes,
+            self._expectations,
+            self._layout,
+            self._task,
+            self._calibration,
+            self._kernel_state,
+            self._io,
+            self._row,
+            now_ns,
         )
-        words = self._task.tolist()
-        drive_command = self._drive_command
-        payload = drive_command.pack(words[task.CONTROLWORD], words[task.VELOCITY])
+        self.record.append_array(self._row)
         send_ns = now_ns + EXECUTION_NS
-        sends = [(send_ns, drive_command.frame(self._protect(payload)))]
+        sends = [(send_ns, self._drive_command.frame(payload))]
         if self._cycle % _STATUS_PERIODS == 0:
             sends.append((send_ns, self._status_frame()))
         if self._cycle % _OBSERVER_PERIODS == _OBSERVER_PHASE:
             sends.append((send_ns, self._observer_frame()))
-        self._write_record(now_ns, words)
         self._cycle += 1
         return Actions(next_period(now_ns + 1), tuple(sends))
 
@@ -160,18 +148,3 @@ class Controller:
         page = self._cycle // _OBSERVER_PERIODS % _OBSERVER_PAGES
         value = int(self._kernel_state[k.ST_V1 + page])
         return observer.frame(observer.pack(page, self._cycle & 0xFFFF, value))
-
-    def _write_record(self, now_ns: int, words: list[int]) -> None:
-        io = self._io.tolist()
-        self.record.append(
-            (
-                now_ns,
-                words[task.STATE],
-                words[task.FAULTS],
-                io[k.IO_SETPOINT],
-                io[k.IO_POSITION],
-                words[task.VELOCITY],
-                io[k.IO_FLAGS],
-                *self._kernel_state.tolist()[k.ST_V1 : k.ST_Z4 + 1],
-            )
-        )

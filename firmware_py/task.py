@@ -5,7 +5,10 @@ from enum import IntFlag
 import numpy as np
 from numba.extending import register_jitable
 
+from dbc import e2e
+from dbc.codec import MessageCodec
 from dbc.jit import njit
+from dbc.messages import DriveCommand
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
 from firmware_py.mailbox import CORRUPT, INVALID, OVERRUNS, STALE, VALUES, poll
@@ -38,10 +41,33 @@ STATUSWORD = VALUES
     ARMED,  # whether Enable has been seen withdrawn since the last fault
     RESET_ASKED,  # FaultReset of the last period
     SATURATIONS,  # periods in which the drive's speed limited the command
+    COMMAND_COUNTER,  # E2E counter of DriveCommand
     CONTROLWORD,  # out: CiA 402 controlword
     VELOCITY,  # out: target velocity, 0.25 rpm
-) = range(9)
-TASK_SIZE = 9
+) = range(10)
+TASK_SIZE = 10
+
+RECORD_COLUMNS = (
+    "time_ns",
+    "state",
+    "faults",
+    "setpoint_0p1um",
+    "position_um",
+    "target_velocity_0p25rpm",
+    "flags",
+    "v1",
+    "v2",
+    "v3",
+    "z1",
+    "z2",
+    "z3",
+    "z4",
+)
+_RECORD_KERNEL_STATE = RECORD_COLUMNS.index("v1")
+
+# what the task knows of DriveCommand: the sender's E2E configuration, then where its signals lie
+_CONTROLWORD_START = e2e.CONFIGURATION_SIZE
+_VELOCITY_START = e2e.CONFIGURATION_SIZE + 1
 
 COUNT_MAX = 0xFFFF
 
@@ -177,8 +203,15 @@ def _controlword(statusword, task, conditions):  # type: ignore[no-untyped-def]
     return DISABLE_VOLTAGE
 
 
+def command_layout(message: MessageCodec[..., DriveCommand]) -> np.ndarray:
+    """Return what `period` needs to know of DriveCommand."""
+    controlword, target_velocity = message.fields
+    return np.array([*message.receiver_configuration(), controlword.start, target_velocity.start], np.int64)
+
+
 @njit(
-    "void(int64[:,::1], int64[:,::1], int64[::1], int32[::1], int32[::1], int32[::1])",
+    "uint64(int64[:,::1], int64[:,::1], int64[::1], int64[::1], int32[::1], int32[::1], int32[::1],"
+    " int64[::1], int64)",
     depends=(
         "dbc.e2e",
         "firmware_py.compiled",
@@ -187,17 +220,23 @@ def _controlword(statusword, task, conditions):  # type: ignore[no-untyped-def]
         "firmware_py.state_machine",
     ),
 )
-def period(mailboxes, expectations, task, calibration, state, io):  # type: ignore[no-untyped-def]
-    """Run one control period.
+def period(mailboxes, expectations, layout, task, calibration, state, io, record, now_ns):  # type: ignore[no-untyped-def]
+    """Run one control period; return the protected payload of DriveCommand.
 
     Parameters
     ----------
     mailboxes, expectations : array of int64, a row for each mailbox
         See `firmware_py.mailbox`.
+    layout : array of int64
+        From `command_layout`.
     task : array of int64, shape (TASK_SIZE,)
-        State of the task, updated in place; the command is left in CONTROLWORD and VELOCITY.
+        State of the task, updated in place.
     calibration, state, io : array of int32
         The kernel's.
+    record : array of int64, shape (len(RECORD_COLUMNS),)
+        Filled with this period's row.
+    now_ns : int
+        For the record.
     """
     for row in range(mailboxes.shape[0]):
         poll(mailboxes[row], expectations[row])
@@ -209,3 +248,15 @@ def period(mailboxes, expectations, task, calibration, state, io):  # type: igno
     if task[STATE] == _RUN:
         _control(mailboxes, task, calibration, state, io, before != _RUN)
     task[CONTROLWORD] = _controlword(mailboxes[DRIVE_STATUS, STATUSWORD], task, conditions)
+    record[0] = now_ns
+    record[1] = task[STATE]
+    record[2] = task[FAULTS]
+    record[3] = io[k.IO_SETPOINT]
+    record[4] = io[k.IO_POSITION]
+    record[5] = task[VELOCITY]
+    record[6] = io[k.IO_FLAGS]
+    record[_RECORD_KERNEL_STATE:] = state[k.ST_V1 : k.ST_Z4 + 1]
+    payload = task[CONTROLWORD] << layout[_CONTROLWORD_START]
+    payload |= (task[VELOCITY] & 0xFFFF) << layout[_VELOCITY_START]
+    counter = task[COMMAND_COUNTER : COMMAND_COUNTER + 1]
+    return e2e.profile2_protect(counter, layout[: e2e.CONFIGURATION_SIZE], np.uint64(payload))

@@ -20,6 +20,7 @@ from plant_sim.period import (
     POSITION,
     PRESSURE_A,
     PRESSURE_ACCUMULATOR,
+    TIME,
     expectation,
     run_period,
 )
@@ -75,7 +76,7 @@ class Plant:
             for message in (contract.position_feedback, contract.drive_status, contract.pressure_feedback)
         )
         self._expected = expectation(contract.drive_command)
-        self.record = Record(("time_ns", *COLUMNS), "d")
+        self.record = Record(COLUMNS, "d")
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: at rest, retracted, drive off."""
@@ -117,8 +118,8 @@ class Plant:
             frame.data if frame is not None else 0,
             arrived,
         )
+        self.record.append_array(self._row)
         row = self._row.tolist()
-        self.record.append((self._time_ns, *row))
 
         feedback = contract.position_feedback
         payload = self._protect_position(feedback.pack(_SENSOR_OK, self._sensor.read(row[POSITION])))
@@ -139,6 +140,7 @@ class Plant:
         self._state = initial_state(self._parameters, position_m)
         self._drive = Drive(self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2)
         self._row = np.zeros(len(COLUMNS))
+        self._row[TIME] = self._time_ns
 
     def _take_bench_frames(self) -> None:
         contract = self._contract

@@ -16,6 +16,7 @@ SUBSTEPS = 10
 PERIOD_S = PERIOD_NS * 1e-9
 
 COLUMNS = (
+    "time_ns",
     "position_m",
     "velocity_m_s",
     "pressure_a_pa",
@@ -27,6 +28,7 @@ COLUMNS = (
     "drive_state",
 )
 (
+    TIME,
     POSITION,
     VELOCITY,
     PRESSURE_A,
@@ -36,7 +38,7 @@ COLUMNS = (
     SPEED_COMMAND,  # held by the drive until the next period
     LOAD,  # set by the caller
     DRIVE_STATE,
-) = range(9)
+) = range(10)
 """Indices of a row: the state at its period's start, and what acts during it."""
 
 # what the drive expects of DriveCommand: the receiver's E2E configuration, then where its signals lie
@@ -76,6 +78,7 @@ def run_period(state, parameters, row, periods, drive, receiver, expected, data,
     data, arrived : int
         Payload of the newest DriveCommand; 0 if none arrived since the last call.
     """
+    row[TIME] += periods * PERIOD_NS
     for _ in range(periods):
         advance(state, parameters, row[SPEED_COMMAND], row[LOAD], PERIOD_S, SUBSTEPS)
     row[POSITION] = state[at.POSITION]

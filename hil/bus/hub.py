@@ -19,7 +19,7 @@ from hil.bus.wire import NEVER, Clock, Port, Wire
 QUEUE_FRAMES = 100_000
 """Frames a slow listener may lag behind before further ones are dropped, and counted."""
 
-_MAX_MAIL = 1000
+_MAX_MAIL_BYTES = 32768
 _IDLE_POLL_S = 0.2
 
 
@@ -46,7 +46,7 @@ class RemoteNode:
         self.exchanges = 0
         self._timeout_s = answer_timeout_s
         self._link = connection
-        self._mail: list[bytes] = []
+        self._mail = b""
         connection.setblocking(True)
         timeout = struct.pack("ll", int(answer_timeout_s), int(answer_timeout_s % 1 * 1e6))
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
@@ -61,8 +61,8 @@ class RemoteNode:
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
         """Receive interrupt."""
-        self._mail.append(link.pack_timed(now_ns, frame))
-        if frame.can_id in self.latched and len(self._mail) < _MAX_MAIL:
+        self._mail += link.pack_timed(now_ns, frame)
+        if frame.can_id in self.latched and len(self._mail) < _MAX_MAIL_BYTES:
             return NOTHING
         return self._exchange(link.FRAME, now_ns)
 
@@ -82,7 +82,7 @@ class RemoteNode:
             answer = b""
         if not answer:
             raise NodeGoneError(self.name, "ended")
-        self._mail.clear()
+        self._mail = b""
         self.exchanges += 1
         return link.unpack_actions(answer)
 

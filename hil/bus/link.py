@@ -12,7 +12,6 @@ import socket
 import stat
 import struct
 import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ _FRAME = struct.Struct("<IB3xQ")
 _TIMED_FRAME = struct.Struct("<qIB3xQ")
 _EVENT = struct.Struct("<Bq")
 _WAKE = struct.Struct("<q")
+_WAKE_AND_FRAME = struct.Struct("<qqIB3xQ")
 
 
 class LinkError(Exception):
@@ -55,9 +55,9 @@ def unpack_timed(packet: bytes) -> tuple[int, Frame]:
     return time_ns, Frame(can_id, dlc, data)
 
 
-def pack_event(kind: int, now_ns: int, frames: Iterable[bytes] = ()) -> bytes:
+def pack_event(kind: int, now_ns: int, frames: bytes = b"") -> bytes:
     """Return an event with the (packed, timed) frames that are delivered before it."""
-    return _EVENT.pack(kind, now_ns) + b"".join(frames)
+    return _EVENT.pack(kind, now_ns) + frames
 
 
 def unpack_event(packet: bytes) -> tuple[int, int, list[tuple[int, Frame]]]:
@@ -75,14 +75,16 @@ def pack_actions(actions: Actions) -> bytes:
 
 def unpack_actions(packet: bytes) -> Actions:
     """Return the actions in a node's answer."""
+    if len(packet) == _WAKE_AND_FRAME.size:  # by far the most frequent
+        wake_ns, send_ns, *frame = _WAKE_AND_FRAME.unpack(packet)
+        return Actions(None if wake_ns == _NO_WAKE else wake_ns, ((send_ns, Frame(*frame)),))
     (wake_ns,) = _WAKE.unpack_from(packet)
     return Actions(None if wake_ns == _NO_WAKE else wake_ns, tuple(_timed_frames(packet[_WAKE.size :])))
 
 
 def _timed_frames(packed: bytes) -> list[tuple[int, Frame]]:
-    return [
-        (time_ns, Frame(can_id, dlc, data)) for time_ns, can_id, dlc, data in _TIMED_FRAME.iter_unpack(packed)
-    ]
+    new = tuple.__new__  # a third of the cost of Frame(...)
+    return [(time_ns, new(Frame, frame)) for time_ns, *frame in _TIMED_FRAME.iter_unpack(packed)]
 
 
 def socket_directory() -> Path:

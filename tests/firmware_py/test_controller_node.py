@@ -1,6 +1,7 @@
 """The controller node, driven as its interrupts would drive it: frames in, frames out."""
 
 import ast
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -486,7 +487,7 @@ def test_the_status_is_sent_every_100_ms(running):
         running.period()
         sent += [send_ns for send_ns, f in running.sent if f.can_id == CONTRACT.controller_status.can_id]
     assert len(sent) == 10
-    assert {later - earlier for earlier, later in zip(sent, sent[1:], strict=False)} == {100_000_000}
+    assert {later - earlier for earlier, later in itertools.pairwise(sent)} == {100_000_000}
 
 
 def test_the_observers_seven_pages_go_round_one_per_10_ms(running):
@@ -500,7 +501,7 @@ def test_the_observers_seven_pages_go_round_one_per_10_ms(running):
                 cycles.append(cycle)
     assert sorted(pages[:7]) == list(range(7))
     assert pages[:7] == pages[7:]
-    assert {later - earlier for earlier, later in zip(cycles, cycles[1:], strict=False)} == {10}
+    assert {later - earlier for earlier, later in itertools.pairwise(cycles)} == {10}
 
 
 def test_the_status_shows_the_assumed_execution_time(running):

@@ -1,0 +1,343 @@
+"""Wrong input: one line that says what is wrong and what to do, exit code 2, nothing half-written."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from bench_runs import SAFETY_NET_S, alive, background, children, command_line, hil, wait_until
+
+from dbc.contract import PACKAGED_DBC
+from hil import cli
+from hil.bus import link
+from hil.scenario import ScenarioError, load_scenario
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run the command line in this process; it must refuse with one line, which is returned."""
+    assert cli.main([str(argument) for argument in arguments]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = said.err.splitlines()
+    assert len(lines) == 1, said.err
+    assert lines[0].startswith("hil: ")
+    return lines[0]
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_half_written(tmp_path: Path):
+    yield
+    left = [path for path in tmp_path.rglob("*") if path.name.startswith(".unfinished-")]
+    assert left == []
+    out = tmp_path / "out"
+    assert not out.exists() or list(out.iterdir()) == []
+    assert list(link.socket_directory().iterdir()) == []
+
+
+# scenarios
+
+
+def test_an_unknown_scenario(capsys, out):
+    line = refused(capsys, "run", "sinus", "--out", out)
+    assert "unknown scenario 'sinus'" in line
+    assert "sine" in line
+    assert "full_stroke" in line
+
+
+def test_a_scenario_file_that_is_not_there(capsys, out, tmp_path):
+    assert "no scenario file" in refused(capsys, "run", tmp_path / "none.toml", "--out", out)
+
+
+GOOD = 'title = "t"\nreference = "sine"\nduration_s = 1.0\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("title = ", "line 1"),
+        ("title = \x00", "line 1"),
+        (GOOD + GOOD, "title"),
+        ("", "missing key 'duration_s'"),
+        ('title = "t"\nreference = "sine"\n', "missing key 'duration_s'"),
+        (GOOD + "speed = 1\n", "unknown key 'speed'"),
+        (GOOD.replace('"sine"', '"cosine"'), "'cosine' is not one of sine, lift_lower, full_stroke"),
+        (GOOD.replace('"sine"', '["sine"]'), "reference"),
+        (GOOD.replace('"t"', "1"), "title"),
+        (GOOD.replace("1.0", '"1.0"'), "duration_s is '1.0'"),
+        (GOOD.replace("1.0", "0"), "must be from 0.001 to 3600 s"),
+        (GOOD.replace("1.0", "nan"), "duration_s is nan"),
+        (GOOD.replace("1.0", "true"), "duration_s is True"),
+        (GOOD + "load = 5\n", "load must be a list of [time_s, force_n]"),
+        (GOOD + "load = [[1.0]]\n", "load must be a list of [time_s, force_n]"),
+        (GOOD + 'load = [["a", 1]]\n', "load must be a list of [time_s, force_n]"),
+        (GOOD + "load = [[nan, 1]]\n", "load"),
+        (GOOD + "load = [[1, inf]]\n", "load"),
+        (GOOD + "load = [[1, 1e12]]\n", "load"),
+        (GOOD + "limits = 3\n", "limits"),
+        (GOOD + "[limits]\nadrc = 3\n", "limits.adrc"),
+        (GOOD + "[limits.pid]\nrms_mm = 1\nmax_mm = 1\n", "limits.pid must be one of p, pi, adrc"),
+        (GOOD + "[limits.adrc]\nrms_mm = 1\n", "limits.adrc"),
+        (GOOD + '[limits.adrc]\nrms_mm = "a"\nmax_mm = 1\n', "limits.adrc"),
+        (GOOD + "[paper.adrc]\nrms_mm = 1\nmax_mm = []\n", "paper.adrc"),
+    ],
+)
+def test_a_malformed_scenario_file(capsys, out, tmp_path, text, what):
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    assert what in refused(capsys, "run", file, "--mode", "inprocess", "--out", out)
+
+
+def test_a_scenario_file_that_is_no_text(capsys, out, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_bytes(b"\xff\xfe\x00\x01")
+    assert "mine.toml" in refused(capsys, "run", file, "--out", out)
+
+
+@pytest.mark.parametrize("duration", ["0", "-1", "nan", "inf", "1e9"])
+def test_a_duration_that_makes_no_sense(capsys, out, duration):
+    assert "duration_s" in refused(capsys, "run", "sine", f"--duration={duration}", "--out", out)
+
+
+def test_scenario_errors_are_value_errors_for_those_who_use_the_library():
+    with pytest.raises(ScenarioError):
+        load_scenario("sinus")
+    assert issubclass(ScenarioError, ValueError)
+
+
+# the contract
+
+MODES = ("inprocess", "lockstep", "realtime")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_dbc_that_misses_a_message(capsys, out, tmp_path, mode):
+    dbc = tmp_path / "short.dbc"
+    blocks = PACKAGED_DBC.read_text().split("\n\n")
+    kept = [block for block in blocks if not block.startswith("BO_ 288 ")]
+    assert len(kept) == len(blocks) - 1
+    dbc.write_text("\n\n".join(line_without(block, " 288 ") for block in kept))
+    line = refused(capsys, "run", "sine", "--mode", mode, "--dbc", dbc, "--out", out)
+    assert "short.dbc: message PositionSetpoint is missing: add it" in line
+
+
+def line_without(block: str, text: str) -> str:
+    return "\n".join(line for line in block.splitlines() if text not in line)
+
+
+@pytest.mark.parametrize("content", [b"not a dbc", b"\xff\x00"])
+def test_a_dbc_that_is_none(capsys, out, tmp_path, content):
+    dbc = tmp_path / "broken.dbc"
+    dbc.write_bytes(content)
+    assert "broken.dbc" in refused(capsys, "run", "sine", "--dbc", dbc, "--out", out)
+
+
+def test_a_dbc_that_is_not_there(capsys, out):
+    line = refused(capsys, "run", "sine", "--dbc", "/nowhere/my.dbc", "--out", out)
+    assert "/nowhere/my.dbc: cannot be read" in line
+
+
+@pytest.mark.parametrize("module", ["plant_sim", "firmware_py"])
+def test_a_single_side_refuses_a_bad_dbc_too(tmp_path, module):
+    dbc = tmp_path / "broken.dbc"
+    dbc.write_text("not a dbc")
+    with background(module, "-i", "hilbus", "-c", "test", "--dbc", str(dbc)) as side:
+        _, said = side.communicate(timeout=SAFETY_NET_S)
+    assert side.returncode == 2
+    assert said.count("\n") == 1
+    assert "not a valid DBC" in said
+
+
+# where the results go
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_out_directory_that_cannot_be_written(capsys, tmp_path, mode):
+    file = tmp_path / "file"
+    file.write_text("")
+    line = refused(capsys, "run", "sine", "--mode", mode, "--out", file / "deeper")
+    assert f"cannot write to {file / 'deeper'}" in line
+    assert "choose another --out" in line
+
+
+def test_an_out_directory_that_is_a_file(capsys, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("keep me")
+    assert "cannot write" in refused(capsys, "run", "sine", "--out", file)
+    assert file.read_text() == "keep me"
+
+
+def test_a_refused_run_does_not_touch_earlier_results(capsys, out):
+    out.mkdir()
+    (out / "result.json").write_text("{}")
+    refused(capsys, "run", "sine", "--dbc", "/nowhere/my.dbc", "--out", out)
+    assert [file.name for file in out.iterdir()] == ["result.json"]
+    (out / "result.json").unlink()
+
+
+def test_a_refused_run_does_not_leave_the_folder_it_made(capsys, out):
+    refused(capsys, "run", "sine", "--dbc", "/nowhere/my.dbc", "--out", out)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("suffix", [".xyz", "log", ""])
+def test_an_unknown_log_suffix(capsys, out, suffix):
+    line = refused(capsys, "run", "sine", "--log", suffix, "--out", out)
+    assert f"no bus log can be written as {suffix!r}: choose one of" in line
+
+
+def test_a_log_format_whose_package_is_missing_is_refused_before_the_run(capsys, out):
+    pytest.importorskip_missing = None
+    try:
+        import asammdf  # noqa: F401
+    except ImportError:
+        assert ".mf4" in refused(capsys, "run", "sine", "--mode", "inprocess", "--log", ".mf4", "--out", out)
+
+
+# the bus
+
+
+@pytest.mark.parametrize("bit_rate", ["0", "-1", "9999", "1000001"])
+@pytest.mark.parametrize("command", [("run", "sine"), ("bus", "--channel", "test")], ids=["run", "bus"])
+def test_a_bit_rate_that_classic_can_does_not_have(capsys, command, bit_rate):
+    line = refused(capsys, *command, f"--bitrate={bit_rate}")
+    assert f"bit rate {bit_rate} is not from 10000 to 1000000 bit/s" in line
+
+
+def test_an_interface_in_virtual_time(capsys, out):
+    line = refused(capsys, "run", "sine", "-i", "socketcan", "-c", "vcan0", "--out", out)
+    assert "--interface needs --mode realtime" in line
+
+
+def test_an_interface_without_a_channel(capsys, out):
+    line = refused(capsys, "run", "sine", "--mode", "realtime", "-i", "socketcan", "--out", out)
+    assert "--interface needs --channel" in line
+
+
+def test_an_interface_that_does_not_exist(capsys, out):
+    line = refused(capsys, "run", "sine", "--mode", "realtime", "-i", "nosuch", "-c", "x", "--out", out)
+    assert "nosuch" in line
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_channel_name_that_cannot_be(capsys, out, mode):
+    assert "channel name 'a/b'" in refused(capsys, "run", "sine", "--mode", mode, "-c", "a/b", "--out", out)
+
+
+def test_a_second_firmware_on_the_same_channel():
+    with background("hil", "bus", "--channel", "test") as bus:
+        assert "hilbus channel 'test'" in bus.stdout.readline()
+        with background("firmware_py", "-i", "hilbus", "-c", "test") as first:
+            assert "controller is on" in first.stderr.readline()
+            with background("firmware_py", "-i", "hilbus", "-c", "test") as second:
+                _, said = second.communicate(timeout=SAFETY_NET_S)
+            assert second.returncode == 2
+            assert said.count("\n") == 1
+            assert "has a controller already: stop it or choose another channel" in said
+            assert first.poll() is None
+            first.send_signal(signal.SIGINT)
+            first.communicate(timeout=SAFETY_NET_S)
+            assert first.returncode == 0
+        bus.send_signal(signal.SIGTERM)
+        bus.communicate(timeout=SAFETY_NET_S)
+        assert bus.returncode == 0
+
+
+@pytest.mark.parametrize("module", ["plant_sim", "firmware_py"])
+def test_a_second_side_during_a_lockstep_run(tmp_path, module):
+    """The run is not disturbed; the one who comes late is told."""
+    scenario = tmp_path / "long.toml"
+    scenario.write_text(GOOD.replace("1.0", "3600"))
+    with background("hil", "run", str(scenario), "-c", "test", "--out", str(tmp_path / "elsewhere")) as bench:
+        sides = wait_until(lambda: len(children(bench.pid)) == 2 and children(bench.pid), "the sides start")
+        wait_until(lambda: link.socket_path("test").exists(), "the hub is there")
+        wait_until(lambda: named_on("test", module), "the side is on the channel")
+        with background(module, "-i", "hilbus", "-c", "test") as second:
+            _, said = second.communicate(timeout=SAFETY_NET_S)
+        assert (second.returncode, said.count("\n")) == (2, 1)
+        assert "already" in said
+        assert bench.poll() is None
+        bench.send_signal(signal.SIGINT)
+        bench.communicate(timeout=SAFETY_NET_S)
+        assert bench.returncode == 130
+    wait_until(lambda: not any(alive(pid) for pid in sides), "no process is left")
+
+
+def named_on(channel: str, module: str) -> bool:
+    """Tell whether a node of that module's name is on a channel, by trying to say hello in its name."""
+    name = {"plant_sim": "plant", "firmware_py": "controller"}[module]
+    try:
+        greeting = {"role": "node", "name": name, "accepts": [], "latched": [], "transmits": []}
+        link.connect(channel, greeting)[0].close()
+    except link.LinkError as error:
+        return "already" in str(error)
+    raise AssertionError("we took its place")
+
+
+# a side that hangs
+
+
+def test_a_plant_that_never_answers(tmp_path, out):
+    scenario = tmp_path / "long.toml"
+    scenario.write_text(GOOD.replace("1.0", "3600"))
+    command = ["run", str(scenario), "--out", str(out), "-c", "test", "--answer-timeout", "1"]
+    with background("hil", *command) as bench:
+        (plant,) = wait_until(
+            lambda: [pid for pid in children(bench.pid) if "-m plant_sim" in command_line(pid)],
+            "the plant starts",
+        )
+        sides = children(bench.pid)
+        listen_until_frames_come("test")
+        os.kill(plant, signal.SIGSTOP)
+        _, said = bench.communicate(timeout=SAFETY_NET_S)
+    assert bench.returncode == 2
+    assert said.count("\n") == 1
+    assert "the plant process did not answer for 1 s at bus time" in said
+    assert "--answer-timeout" in said
+    wait_until(lambda: not any(alive(pid) for pid in sides), "no process is left")
+
+
+def listen_until_frames_come(channel: str) -> None:
+    import can
+
+    def bus() -> can.BusABC | None:
+        try:
+            return can.Bus(interface="hilbus", channel=channel)
+        except can.CanInitializationError:
+            return None
+
+    with wait_until(bus, "the hub is there") as listener:
+        assert listener.recv(SAFETY_NET_S) is not None
+
+
+def test_sides_that_do_not_come_up_in_time(capsys, out):
+    line = refused(capsys, "run", "sine", "--start-timeout", "0.001", "--out", out)
+    assert "did not come up within 0.001 s: raise --start-timeout" in line
+
+
+@pytest.mark.parametrize("option", ["--start-timeout", "--answer-timeout"])
+@pytest.mark.parametrize("value", ["0", "-1", "x", "nan"])
+def test_a_timeout_that_is_no_time(option, value):
+    ended = hil("run", "sine", f"{option}={value}")
+    assert ended.returncode == 2
+    assert option in ended.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "2", "x", "1/0"])
+def test_a_ratio_that_is_none(capsys, value):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["run", "sine", f"--rt-ratio={value}"])
+    assert ended.value.code == 2
+    assert "--rt-ratio" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_no_command_at_all():
+    ended = subprocess.run([sys.executable, "-m", "hil"], capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "COMMAND" in ended.stderr
