@@ -111,10 +111,14 @@ def _seconds(text: str) -> float:
     return value
 
 
+def _check_bit_rate(bit_rate: int) -> None:
+    if not 10_000 <= bit_rate <= 1_000_000:
+        raise BenchError(f"bit rate {bit_rate} is not from 10000 to 1000000 bit/s")
+
+
 def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
-    if not 10_000 <= arguments.bitrate <= 1_000_000:
-        raise BenchError(f"bit rate {arguments.bitrate} is not from 10000 to 1000000 bit/s")
+    _check_bit_rate(arguments.bitrate)
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
     stopped = StopFlag()
@@ -204,6 +208,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _bus(arguments: argparse.Namespace) -> int:
+    _check_bit_rate(arguments.bitrate)
     stopped = StopFlag()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stopped.set)

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,23 @@ class OutputDirectory:
             raise BenchError(f"no bus log can be written as {log_format!r}: choose one of {known}")
         self.path = path
         self._log_format = log_format
+        self._made = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
         try:
             path.mkdir(parents=True, exist_ok=True)
             self.scratch = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=path))
         except OSError as error:
             raise BenchError(f"cannot write to {path} ({error.strerror}): choose another --out") from error
+        try:
+            write_bus_log(self.scratch / f"probe{log_format}", np.empty((0, 4), np.uint64))
+        except (ImportError, NotImplementedError) as error:  # a package that this format needs is missing
+            self._clean_up()
+            raise BenchError(f"no bus log can be written as {log_format!r}: {error}") from error
 
     def __enter__(self) -> "OutputDirectory":
         return self
 
     def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self.scratch, ignore_errors=True)
+        self._clean_up()
 
     def write(self, result: dict[str, Any], trace: Trace, traffic: np.ndarray) -> list[Path]:
         """Write all files and return their paths."""
@@ -71,6 +78,13 @@ class OutputDirectory:
         for file in made:
             os.replace(file, self.path / file.name)
         return [self.path / file.name for file in made]
+
+    def _clean_up(self) -> None:
+        """Remove what is not a result, folders made for nothing included."""
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        with suppress(OSError):  # the first folder that holds something ends it
+            for folder in self._made:
+                folder.rmdir()
 
 
 def write_bus_log(path: Path, traffic: np.ndarray) -> None:

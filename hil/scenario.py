@@ -1,5 +1,6 @@
 """A scenario is data: reference, load profile, duration and the limits the run must meet."""
 
+import math
 import tomllib
 from dataclasses import dataclass
 from importlib import resources
@@ -13,6 +14,7 @@ from hil.references import REFERENCES
 
 CONTROLLERS = ("p", "pi", "adrc")
 PERIOD_S = PERIOD_NS * 1e-9
+MAX_LOAD_N = 1e6
 
 
 class ScenarioError(ValueError):
@@ -84,7 +86,7 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
         path = Path(name)
         if not path.is_file():
             raise ScenarioError(f"there is no scenario file {name}")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8", errors="replace")
     elif name in builtin_names():
         path = Path(name)
         text = resources.files("hil.scenarios").joinpath(f"{name}.toml").read_text(encoding="utf-8")
@@ -108,20 +110,25 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
     if unknown := sorted(set(content) - required - optional):
         allowed = ", ".join(sorted(required | optional))
         raise ScenarioError(f"{name}: unknown key {unknown[0]!r}; allowed are {allowed}")
-    if content["reference"] not in REFERENCES:
+    if not isinstance(content["title"], str):
+        raise ScenarioError(f"{name}: title is {content['title']!r}, must be a text")
+    if content["reference"] not in list(REFERENCES):
         raise ScenarioError(
             f"{name}: reference {content['reference']!r} is not one of {', '.join(REFERENCES)}"
         )
     duration_s = content["duration_s"]
-    if not isinstance(duration_s, int | float) or not PERIOD_S <= duration_s <= 3600:
+    if not _is_number(duration_s) or not PERIOD_S <= duration_s <= 3600:
         raise ScenarioError(f"{name}: duration_s is {duration_s!r}, must be from {PERIOD_S} to 3600 s")
-    try:
-        load = tuple((float(time_s), float(force_n)) for time_s, force_n in content.get("load", []))
-    except (TypeError, ValueError) as error:
-        raise ScenarioError(f"{name}: load must be a list of [time_s, force_n]") from error
+    load = content.get("load", [])
+    if not isinstance(load, list) or not all(_is_load_step(step) for step in load):
+        raise ScenarioError(
+            f"{name}: load must be a list of [time_s, force_n], from 0 s on and within {MAX_LOAD_N:g} N"
+        )
     for key in ("limits", "paper"):
+        if not isinstance(content.get(key, {}), dict):
+            raise ScenarioError(f"{name}: {key} must be a table by controller")
         for controller, figures in content.get(key, {}).items():
-            if controller not in CONTROLLERS or set(figures) != {"rms_mm", "max_mm"}:
+            if controller not in CONTROLLERS or not _are_figures(figures):
                 raise ScenarioError(
                     f"{name}: {key}.{controller} must be one of {', '.join(CONTROLLERS)} "
                     "with rms_mm and max_mm"
@@ -131,7 +138,29 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
         title=content["title"],
         reference=content["reference"],
         duration_s=float(duration_s),
-        load=load,
+        load=tuple((float(time_s), float(force_n)) for time_s, force_n in load),
         limits=content.get("limits", {}),
         paper=content.get("paper", {}),
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_load_step(step: Any) -> bool:
+    return (
+        isinstance(step, list)
+        and len(step) == 2
+        and all(_is_number(value) for value in step)
+        and step[0] >= 0
+        and abs(step[1]) <= MAX_LOAD_N
+    )
+
+
+def _are_figures(figures: Any) -> bool:
+    return (
+        isinstance(figures, dict)
+        and set(figures) == {"rms_mm", "max_mm"}
+        and all(_is_number(value) for value in figures.values())
     )

@@ -56,6 +56,8 @@ def run_lockstep(options: RunOptions) -> Recording:
                 ending = play(wire, supervisor, options, hub.service)
             except NodeGoneError as error:
                 gone, gone_ns = error, wire.now_ns
+                if error.silent:
+                    processes.kill(error.name)
                 _run_without(error, wire, ports)
             wall_s = time.perf_counter() - ready_s
         simulated_s = wire.now_ns / 1e9

@@ -86,6 +86,10 @@ class NodeProcesses:
             if process.poll() is None:
                 process.terminate()
 
+    def kill(self, name: str) -> None:
+        """End one that does not listen any more."""
+        self._processes[name].kill()
+
     def wait(self) -> None:
         """Wait for both to end; kill what does not."""
         deadline_s = time.monotonic() + _END_TIMEOUT_S

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 import pytest
-from conftest import CheckedController
+from kernel_runs import CheckedController
 
 from firmware_py.calibration import GAINS, INT32_MAX, MAX_SHIFT, MIN_SHIFT, VALUE_RANGES, Calibration
 from firmware_py.compiled import control_reset, control_step

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from adrc_in_floats import FloatAdrc
-from conftest import CASES, CheckedController, make_case, step_through
+from kernel_runs import CASES, CheckedController, make_case, step_through
 
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import ADRC, PI_STAR, LimiterTuning, Tuning

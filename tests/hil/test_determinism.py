@@ -64,11 +64,10 @@ def test_lockstep_gives_the_same_frames_as_one_process(tmp_path, scenario, hashe
         assert all(np.array_equal(one[column], other[column]) for column in one)
 
 
-@pytest.mark.parametrize("bit_rate", [125_000, 500_000, 800_000])
-def test_at_any_bit_rate_too(tmp_path, bit_rate):
+def test_at_another_bit_rate_too(tmp_path):
     short = replace(SINE, duration_s=0.2)
-    here = run_inprocess(options(tmp_path, short, bit_rate=bit_rate))
-    apart = run_lockstep(options(tmp_path, short, bit_rate=bit_rate))
+    here = run_inprocess(options(tmp_path, short, bit_rate=400_000))
+    apart = run_lockstep(options(tmp_path, short, bit_rate=400_000))
     assert sha256(here) == sha256(apart)
 
 
@@ -83,16 +82,10 @@ def test_neither_hash_seed_nor_load_changes_a_lockstep_run(tmp_path, monkeypatch
         assert sha256(run_lockstep(options(tmp_path))) == hashes(SINE)
 
 
-def test_the_hash_seed_does_not_change_a_run_in_one_process(tmp_path):
-    results = [
-        hil(
-            *("run", "sine", "--mode", "inprocess", "--duration", "0.2", "--json"),
-            *("--out", str(tmp_path / seed)),
-            PYTHONHASHSEED=seed,
-        )
-        for seed in ("0", "1234")
-    ]
-    assert len({json.loads(result.stdout)["bus_sha256"] for result in results}) == 1
+def test_the_hash_seed_does_not_change_a_run_in_one_process(tmp_path, hashes):
+    command = ["run", "sine", "--mode", "inprocess", "--duration", "1", "--json", "--out", str(tmp_path)]
+    ended = hil(*command, PYTHONHASHSEED="4321")
+    assert json.loads(ended.stdout)["bus_sha256"] == hashes(SINE)
 
 
 # observers and intruders

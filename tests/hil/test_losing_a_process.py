@@ -248,6 +248,8 @@ def test_losing_a_side_ends_the_run_with_one_line(bench, victim, record_property
 
 
 def test_losing_the_bench_ends_both_sides(bench, record_property):
+    # in sessions of their own, so that a Ctrl-C at the terminal reaches the bench only
+    assert all(os.getsid(pid) == pid for pid in bench.sides.values())
     begin_s = time.monotonic()
     bench.process.kill()
     bench.wait_until_all_is_gone()
@@ -288,11 +290,6 @@ def assert_whole(log: Path) -> None:
         == (CONTRACT.position_feedback.can_id, CONTRACT.position_feedback.dlc)
     }
     assert statuses <= {"INITIAL", "OK"}
-
-
-def test_ctrl_c_reaches_the_bench_only(bench):
-    """The sides are in sessions of their own: a signal to the terminal's group does not touch them."""
-    assert all(os.getsid(pid) == pid for pid in bench.sides.values())
 
 
 def test_a_run_interrupted_while_its_sides_start_leaves_nothing(tmp_path):
