@@ -1,4 +1,4 @@
-"""The tracking figures in README, from runs over the bus: ``make figures`` writes them, a test compares them."""
+"""The tracking figures in README, from runs over the bus: ``make figures`` writes, a test compares them."""
 
 import argparse
 import sys

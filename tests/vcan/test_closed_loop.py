@@ -20,8 +20,9 @@ RUN = 2
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("vcan_sine")
-    command = [sys.executable, "-m", "hil", "run", "sine", "--mode", "realtime", "-i", "socketcan", "-c", "vcan0"]
-    command += ["--duration", "3", "--rt-ratio", RT_RATIO, "--out", str(out), "--start-timeout", "300"]
+    command = [sys.executable, "-m", "hil", "run", "sine", "--mode", "realtime"]
+    command += ["-i", "socketcan", "-c", "vcan0", "--rt-ratio", RT_RATIO]
+    command += ["--duration", "3", "--out", str(out), "--start-timeout", "300"]
     finished = subprocess.run(command, capture_output=True, text=True)
     assert finished.returncode in (0, 1), finished.stderr
     print(finished.stdout)
