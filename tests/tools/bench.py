@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
+from readme_figures import BENCH, speed_table, write_to_readme
 
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
@@ -31,7 +32,6 @@ from hil.run.lockstep import run_lockstep
 from hil.run.options import RunOptions
 from hil.scenario import PERIOD_S, Scenario, load_scenario
 
-OUTPUT = Path(__file__).parents[2] / "docs" / "bench.json"
 PYTHON_LOOP = 1_000_000
 
 
@@ -101,8 +101,8 @@ def subjects() -> dict[str, Callable[[], float]]:
 
 
 def main() -> int:
-    """Measure, print, and write ``docs/bench.json``."""
-    parser = argparse.ArgumentParser(description="Measure speed and write docs/bench.json.")
+    """Measure, print, and write ``docs/bench.json`` and README's table of it."""
+    parser = argparse.ArgumentParser(description="Measure speed, write docs/bench.json and README.")
     parser.add_argument("--rounds", type=int, default=9, help="interleaved rounds (default 9)")
     arguments = parser.parse_args()
     measured = subjects()
@@ -122,8 +122,8 @@ def main() -> int:
     machine = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
     machine["python"] = platform.python_version()
     report = {"rounds": arguments.rounds, "machine": machine, "figures": figures}
-    OUTPUT.parent.mkdir(exist_ok=True)
-    OUTPUT.write_text(json.dumps(report, indent=2) + "\n")
+    BENCH.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_to_readme("bench", speed_table())
     return 0
 
 

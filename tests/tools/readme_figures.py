@@ -1,6 +1,7 @@
-"""The tracking figures in README, from runs over the bus: ``make figures`` writes, a test compares them."""
+"""The figures in README: tracking from runs over the bus (``make figures``), speed from ``make bench``."""
 
 import argparse
+import json
 import sys
 import tempfile
 from pathlib import Path
@@ -15,7 +16,7 @@ from hil.scenario import load_scenario
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PICTURE = ROOT / "docs" / "sine.png"
-BEGIN, END = "<!-- figures: begin -->\n", "<!-- figures: end -->\n"
+BENCH = ROOT / "docs" / "bench.json"
 SCENARIOS = ("sine", "sine_load", "lift_lower", "lift_lower_load")
 CONTROLLERS = ("p", "pi", "adrc")
 
@@ -42,9 +43,46 @@ def table(picture: Path | None = None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def in_readme() -> str:
-    """Return the table that README shows now."""
-    return README.read_text(encoding="utf-8").split(BEGIN)[1].split(END)[0]
+SPEED_ROWS = (  # figure of bench.json, what it is, unit, format
+    ("inprocess_x", "all nodes in one process, over the bus", "x real time", ".1f"),
+    ("lockstep_x", "three processes in lock-step, over the bus", "x real time", ".1f"),
+    ("jitted_loop_x", "kernel and plant in one compiled loop, no bus", "x real time", ".0f"),
+    ("adrc_step_sine_us", "one ADRC step, over the sine", "µs", ".3f"),
+    ("adrc_step_worst_us", "one ADRC step, random inputs (all roots)", "µs", ".3f"),
+    ("pi_step_sine_us", "one PI step, over the sine", "µs", ".3f"),
+    ("python_loop_ms", "a plain Python loop, to compare machines by", "ms", ".1f"),
+)
+
+
+def speed_table() -> str:
+    """Return what the last ``make bench`` measured as a Markdown table."""
+    bench = json.loads(BENCH.read_text(encoding="utf-8"))
+    lines = ["| what | median | range | |", "|---|---|---|---|"]
+    for name, label, unit, form in SPEED_ROWS:
+        figure = bench["figures"][name]
+        spread = f"{figure['min']:{form}} to {figure['max']:{form}}"
+        lines.append(f"| {label} | {figure['median']:{form}} | {spread} | {unit} |")
+    machine = bench["machine"]
+    rounds, python = bench["rounds"], machine["python"]
+    lines += ["", f"{rounds} interleaved rounds on {machine['cores']} shared cores, Python {python}."]
+    return "\n".join(lines) + "\n"
+
+
+def in_readme(block: str) -> str:
+    """Return what README shows in the block of that name now."""
+    begin, end = _marks(block)
+    return README.read_text(encoding="utf-8").split(begin)[1].split(end)[0]
+
+
+def write_to_readme(block: str, content: str) -> None:
+    """Replace the block of that name."""
+    begin, end = _marks(block)
+    before, rest = README.read_text(encoding="utf-8").split(begin)
+    README.write_text(before + begin + content + end + rest.split(end)[1], encoding="utf-8")
+
+
+def _marks(block: str) -> tuple[str, str]:
+    return f"<!-- {block}: begin -->\n", f"<!-- {block}: end -->\n"
 
 
 def main() -> int:
@@ -54,9 +92,7 @@ def main() -> int:
     if not parser.parse_args().write:
         print(table(), end="")
         return 0
-    fresh = table(PICTURE)
-    before, rest = README.read_text(encoding="utf-8").split(BEGIN)
-    README.write_text(before + BEGIN + fresh + END + rest.split(END)[1], encoding="utf-8")
+    write_to_readme("figures", table(PICTURE))
     return 0
 
 
