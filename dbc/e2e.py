@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from dbc.jit import njit
+from dbc.jit import entry_point, njit
 
 MAX_COUNTER = 15
 
@@ -186,6 +186,9 @@ def receiver_configuration(
     return np.array([*_checked_data_ids(data_ids), *words], np.int64)
 
 
+_protect, _check = entry_point(profile2_protect), entry_point(profile2_check)
+
+
 class Protector:
     """Sender side: ``E2E_P02Protect`` with its state.
 
@@ -205,7 +208,7 @@ class Protector:
 
     def protect(self, data: int) -> int:
         """Return `data` with the next counter and the CRC filled in; the first counter sent is 1."""
-        protected: int = profile2_protect(self._state, self._configuration, data)
+        protected: int = _protect(self._state, self._configuration, data)
         return protected
 
 
@@ -231,7 +234,7 @@ class Checker:
 
     def check(self, data: int | None) -> Status:
         """Check one received payload; None means that nothing arrived since the last call."""
-        return Status(profile2_check(self._state, self._configuration, data or 0, data is not None))
+        return Status(_check(self._state, self._configuration, data or 0, data is not None))
 
 
 def _checked_data_ids(data_ids: Sequence[int]) -> tuple[int, ...]:

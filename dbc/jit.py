@@ -47,3 +47,13 @@ def njit(signature: str, *, depends: tuple[str, ...] = ()) -> Callable[[Callable
         return dispatcher
 
     return compile_function
+
+
+def entry_point(function: Any) -> Callable[..., Any]:
+    """Return what a function of `njit` compiled to, for calls from Python in a hot loop.
+
+    It skips numba's choice among signatures, which costs as much again as the call; there is only one.
+    """
+    (compiled,) = function.overloads.values()
+    call: Callable[..., Any] = compiled.entry_point
+    return call

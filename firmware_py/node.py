@@ -7,6 +7,7 @@ import numpy as np
 from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from dbc.frame import Frame
+from dbc.jit import entry_point
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
@@ -28,6 +29,7 @@ _OBSERVER_PAGES = 7
 _PLAUSIBLE_POSITION_UM = -10_000, 410_000
 _PLAUSIBLE_SETPOINT_0P1UM = -10_000, 4_010_000
 _USABLE_SENSOR_STATUS = 0, 1
+_period, _receive = entry_point(task.period), entry_point(mailbox.receive)
 
 
 class Controller:
@@ -98,7 +100,7 @@ class Controller:
         """Receive interrupt: latch."""
         row = self._rows.get(frame.can_id)
         if row is not None:
-            mailbox.receive(row, frame.data, frame.dlc)
+            _receive(row, frame.data, frame.dlc)
         else:
             self._bench_reset |= self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET
         return NOTHING
@@ -107,7 +109,7 @@ class Controller:
         """Timer interrupt: one control period."""
         if self._bench_reset:
             self.on_start(now_ns)
-        payload = task.period(
+        payload = _period(
             self._mailboxes,
             self._expectations,
             self._layout,

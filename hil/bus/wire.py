@@ -10,11 +10,13 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 from dbc.frame import EFF_FLAG, Frame
+from dbc.jit import entry_point
 from dbc.node import NOTHING, Actions, Node
 from hil.bus.wire_time import classic_bits
 
 NEVER = 1 << 62
 INTERMISSION_BITS = 3
+_frame_bits = entry_point(classic_bits)
 _NS_PER_S = 1_000_000_000
 
 
@@ -201,7 +203,7 @@ class Wire:
 
     def _arbitrate(self) -> None:
         *_, port, frame = heappop(self._pending)
-        bits = classic_bits(*frame)
+        bits = _frame_bits(*frame)
         start_ns = self.now_ns
         self._on_wire = port, frame
         self._end_ns = start_ns + (bits - INTERMISSION_BITS) * _NS_PER_S // self.bit_rate
