@@ -11,7 +11,7 @@ from dbc.jit import njit
 from dbc.messages import DriveCommand
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
-from firmware_py.mailbox import CORRUPT, INVALID, OVERRUNS, STALE, VALUES, poll
+from firmware_py.mailbox import CORRUPT, INVALID, IS_NEW, OVERRUNS, STALE, VALUES, poll
 from firmware_py.state_machine import (
     CALIBRATED,
     DRIVE_ENABLED,
@@ -38,7 +38,7 @@ STATUSWORD = VALUES
     FAULTS,  # Fault bits: what is wrong now; in the safe state also what led there
     IS_CALIBRATED,
     DEFAULT_LAW,
-    ARMED,  # whether Enable has been seen withdrawn since the last fault
+    ARMED,  # whether a command without Enable came since power-on or the last fault
     RESET_ASKED,  # FaultReset of the last period
     SATURATIONS,  # periods in which the drive's speed limited the command
     COMMAND_COUNTER,  # E2E counter of DriveCommand
@@ -133,7 +133,7 @@ def _conditions(mailboxes, task):  # type: ignore[no-untyped-def]
     task[RESET_ASKED] = reset_asked
     if task[STATE] != _STANDBY and task[STATE] != _RUN:
         task[ARMED] = 0
-    elif not enable:
+    elif mailboxes[COMMAND, IS_NEW] and not enable:
         task[ARMED] = 1
     conditions = 0
     if task[IS_CALIBRATED]:

@@ -14,8 +14,10 @@ BRING_UP_PERIODS = 100
 """Periods from the supervisor's start to the first one of the reference: the drive is enabled in them."""
 
 _ENABLE_PERIOD = 20
+_BRING_UP_COMMANDS = (1, 2, _ENABLE_PERIOD)
+"""The first only starts the receiver's counter; the second, without Enable, arms the controller."""
+
 _COMMAND_PERIODS = 100
-_COMMAND_PHASE = 1  # not with the reset, which empties the receivers' mailboxes
 
 
 class Supervisor:
@@ -77,7 +79,7 @@ class Supervisor:
         if period == 0:
             frames.append(self._reset_frame())
             frames.append(self._load_frame())
-        if period % _COMMAND_PERIODS == _COMMAND_PHASE or period == _ENABLE_PERIOD:
+        if period in _BRING_UP_COMMANDS or (period > 0 and period % _COMMAND_PERIODS == 0):
             frames.append(self._command_frame(period >= _ENABLE_PERIOD))
         if k in self._loads:
             self._load_n = self._loads[k]

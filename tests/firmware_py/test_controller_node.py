@@ -459,6 +459,15 @@ def test_a_bench_reset_forgets_everything(running):
     assert controller_status(running)["MailboxOverruns"] == 0
 
 
+def test_a_restarted_controller_does_not_move_on_an_enable_that_was_held_all_along(running):
+    running.controller.on_start(running.now_ns)
+    assert running.periods(20).state == State.STANDBY
+    running.inputs.enable = 0
+    running.period()
+    running.inputs.enable = 1
+    assert running.periods(2).state == State.RUN
+
+
 @pytest.mark.parametrize("command", [BenchCommand.NONE, BenchCommand.SET_FAULT, BenchCommand.SCALE_PARAMETER])
 def test_other_bench_commands_do_not_reset(running, command):
     bench = CONTRACT.bench_control
