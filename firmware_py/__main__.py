@@ -9,10 +9,12 @@ from firmware_py.tuning import Tuning
 from hil.bus.wire import Clock
 from hil.run.node_process import add_node_arguments, node_main
 
+DESCRIPTION = "The firmware emulator as a process of its own on a bus."
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run the controller until it is stopped."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_py", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m firmware_py", description=DESCRIPTION)
     add_node_arguments(parser)
 
     def build(arguments: argparse.Namespace) -> Controller:

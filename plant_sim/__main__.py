@@ -10,14 +10,20 @@ from plant_sim.node import Plant
 from plant_sim.parameters import PlantParameters
 from plant_sim.sensors import PositionSensor
 
+DESCRIPTION = "Drive, sensors and simulated machine as a process of its own on a bus."
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run the plant until it is stopped."""
-    parser = argparse.ArgumentParser(prog="python -m plant_sim", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m plant_sim", description=DESCRIPTION)
     add_node_arguments(parser)
-    parser.add_argument("--lsb-um", type=int, default=1, help="position sensor resolution, µm (default 1)")
-    parser.add_argument("--noise-um", type=float, default=0.0, help="position noise, µm RMS (default 0)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
+    parser.add_argument(
+        "--lsb-um", type=int, default=1, metavar="UM", help="position sensor resolution, µm (default 1)"
+    )
+    parser.add_argument(
+        "--noise-um", type=float, default=0.0, metavar="UM", help="position noise, µm RMS (default 0)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the noise (default 0)")
 
     def build(arguments: argparse.Namespace) -> Plant:
         sensor = PositionSensor(arguments.lsb_um * 1e-6, arguments.noise_um * 1e-6, arguments.seed)

@@ -5,7 +5,8 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
@@ -36,18 +37,14 @@ class RecordingNode(Node, Protocol):
 
 def add_node_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that both sides share; -i, -c and -b are python-can's."""
-    parser.add_argument(
-        "-i", "--interface", help="python-can interface (default: python-can's configuration)"
-    )
-    parser.add_argument("-c", "--channel", help="channel of the interface, e.g. vcan0 or a hilbus name")
-    parser.add_argument("-b", "--bitrate", type=int, help="bit/s, for adapters that set it")
+    parser.add_argument("-i", "--interface", metavar="I", help="python-can interface, e.g. socketcan, hilbus")
+    parser.add_argument("-c", "--channel", metavar="C", help="its channel, e.g. vcan0")
+    parser.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s, for adapters that set it")
     parser.add_argument(
         "--rt-ratio", type=ratio, default=Fraction(1), metavar="R", help="node time per wall time"
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="write NAME.npz there at the end")
-    parser.add_argument(
-        "--dbc", type=Path, metavar="FILE", help="another DBC (default: the packaged ddh.dbc)"
-    )
+    parser.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
 
 
@@ -78,31 +75,47 @@ def node_main(
     arguments = parser.parse_args(argv)
     try:
         node = build(arguments)
+    except (ContractError, ValueError) as error:
+        return _complain(parser, error, EXIT_USAGE)
+    try:
+        if arguments.record:
+            arguments.record.mkdir(parents=True, exist_ok=True)
         if arguments.interface == "hilbus" and arguments.channel:
             connection, answer = _attach(arguments.channel, node)
             if answer["virtual"]:
-                serve(node, connection, arguments.channel)
+                with _recorded(node, arguments.record):
+                    serve(node, connection, arguments.channel)
             else:
                 bus: can.BusABC = HilBus(arguments.channel, greeted=(connection, answer))
                 _run_in_wall_time(node, bus, arguments, clock)
         else:
-            given = {key: getattr(arguments, key) for key in ("interface", "channel", "bitrate")}
-            bus = can.Bus(**{key: value for key, value in given.items() if value is not None})
-            _run_in_wall_time(node, bus, arguments, clock)
-        if arguments.record:
-            node.record.save(arguments.record / f"{node.name}.npz")
+            _run_in_wall_time(node, _open_bus(arguments), arguments, clock)
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
-    except (
-        ContractError,
-        DuplicateNodeError,
-        can.CanInitializationError,
-        can.CanInterfaceNotImplementedError,
-    ) as e:
-        return _complain(parser, e, EXIT_USAGE)
+    except (DuplicateNodeError, can.CanInitializationError, can.CanInterfaceNotImplementedError) as error:
+        return _complain(parser, error, EXIT_USAGE)
     except (LinkError, can.CanError, OSError) as error:
         return _complain(parser, error, EXIT_BROKEN)
     return 0
+
+
+@contextmanager
+def _recorded(node: RecordingNode, directory: Path | None) -> Iterator[None]:
+    """Save the node's record at the end, whatever ended it."""
+    try:
+        yield
+    finally:
+        if directory is not None:
+            node.record.save(directory / f"{node.name}.npz")
+
+
+def _open_bus(arguments: argparse.Namespace) -> can.BusABC:
+    given = {key: getattr(arguments, key) for key in ("interface", "channel", "bitrate")}
+    try:
+        return can.Bus(**{key: value for key, value in given.items() if value is not None})
+    except (can.CanError, OSError, ValueError) as error:
+        where = f"{arguments.interface or 'the configured interface'} channel {arguments.channel!r}"
+        raise can.CanInitializationError(f"cannot open {where} ({error}): check -i and -c") from error
 
 
 def serve(node: Node, connection: socket.socket, channel: str) -> None:
@@ -153,7 +166,9 @@ def _hello(node: Node) -> dict[str, object]:
     }
 
 
-def _run_in_wall_time(node: Node, bus: can.BusABC, arguments: argparse.Namespace, clock: Clock) -> None:
+def _run_in_wall_time(
+    node: RecordingNode, bus: can.BusABC, arguments: argparse.Namespace, clock: Clock
+) -> None:
     stopped = StopFlag()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stopped.set)
@@ -167,7 +182,8 @@ def _run_in_wall_time(node: Node, bus: can.BusABC, arguments: argparse.Namespace
         runner = RealtimeNode(node, bus, arguments.rt_ratio, clock)
         runner.listen_for_duplicate()
         print(f"{node.name} is on {bus.channel_info}; Ctrl-C ends it", file=sys.stderr, flush=True)
-        runner.run(keep_running)
+        with _recorded(node, arguments.record):
+            runner.run(keep_running)
     late = runner.lateness.summary()
     print(
         f"{node.name}: timer late by {late['p50_us']:.0f} µs (median), {late['p99_us']:.0f} µs (p99), "
