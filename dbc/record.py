@@ -39,6 +39,8 @@ class Record:
         return dict(zip(self.columns, table.T, strict=True))
 
     def save(self, path: Path) -> None:
-        """Write the columns to an `.npz` file."""
+        """Write the columns to an `.npz` file, whole or not at all."""
         columns: dict[str, Any] = self.columns_by_name()
-        np.savez(path, **columns)
+        unfinished = path.with_suffix(".unfinished.npz")
+        np.savez(unfinished, **columns)
+        unfinished.replace(path)

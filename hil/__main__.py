@@ -1,7 +1,19 @@
-"""``python -m hil``."""
+"""``hil`` and ``python -m hil``."""
 
+import signal
 import sys
 
-from hil.cli import main
 
-sys.exit(main())
+def main() -> int:
+    """Run the command line; an interrupt while it is being loaded ends it quietly."""
+    try:
+        from hil.cli import main as run  # compiles the plant and the kernel when they have changed
+
+        return run()
+    except KeyboardInterrupt:
+        print("hil: interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

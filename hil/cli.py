@@ -2,11 +2,11 @@
 
 import argparse
 import json
-import os
 import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dbc.contract import Contract, ContractError
-from hil.bus.hub import Hub, StopFlag
+from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.wire import Wire
 from hil.measure import result_of, trace_of
@@ -24,16 +24,25 @@ from hil.report import OutputDirectory
 from hil.run.inprocess import run_inprocess
 from hil.run.lockstep import run_lockstep
 from hil.run.node_process import ratio
-from hil.run.options import DEFAULT_BIT_RATE, INTERRUPTED, BenchError, RunOptions
+from hil.run.options import (
+    DEFAULT_BIT_RATE,
+    HUB_GREETING,
+    INTERRUPTED,
+    BenchError,
+    InterruptedRunError,
+    RunOptions,
+)
 from hil.run.realtime_bench import run_realtime
+from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
+from hil.supervisor import BRING_UP_S
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 MODES = {"lockstep": run_lockstep, "inprocess": run_inprocess, "realtime": run_realtime}
 EXIT_CODES = """exit codes: 0 played and within the scenario's limits; 1 played, limits missed;
-2 wrong input; 3 a process was lost; 130 interrupted"""
+2 wrong input or no answer; 3 a process was lost; 130 interrupted"""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -41,6 +50,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         code: int = arguments.command(arguments)
+    except InterruptedRunError as error:
+        print(f"hil: {error}", file=sys.stderr)
+        return EXIT_INTERRUPTED
     except (BenchError, ScenarioError, ContractError, LinkError, can.CanInitializationError) as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
@@ -51,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="hil", description="Bench for an integer controller of a hydraulic crane over CAN."
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version('ddh-hil')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser(
@@ -106,8 +119,8 @@ class _OneLineEach(argparse.RawDescriptionHelpFormatter):
 
 def _seconds(text: str) -> float:
     value = float(text)
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not a time above 0 s")
+    if not 1e-3 <= value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} is not a time of 0.001 s or more")
     return value
 
 
@@ -121,13 +134,11 @@ def _run(arguments: argparse.Namespace) -> int:
     _check_bit_rate(arguments.bitrate)
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
-    stopped = StopFlag()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stopped.set)
+    stopped = StopFlag.on_signals()
     console = Console(stderr=True)
     out = arguments.out or Path("out") / scenario.name
     with OutputDirectory(out, arguments.log) as folder:
-        with _progress(console, scenario.name, scenario.duration_s) as progress:
+        with _progress(console, scenario.name, scenario.duration_s + BRING_UP_S) as progress:
             options = RunOptions(
                 scenario=scenario,
                 controller=arguments.controller,
@@ -152,8 +163,8 @@ def _run(arguments: argparse.Namespace) -> int:
     else:
         Console().print(_table(result))
         print(f"{', '.join(file.name for file in files)} in {out}")
-    if recording.ending:
-        print(f"hil: {recording.ending}", file=sys.stderr)
+    if recording.ending or result["verdict"]:
+        print(f"hil: {recording.ending or result['verdict']}", file=sys.stderr)
     if recording.broken:
         return EXIT_BROKEN
     if recording.ending == INTERRUPTED:
@@ -174,7 +185,7 @@ def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
 
         def advance(simulated_s: float) -> None:
             bar.update(
-                task, completed=simulated_s, description=name, at=f"{simulated_s:.1f} of {duration_s:g} s"
+                task, completed=simulated_s, description=name, at=f"{simulated_s:.1f} of {duration_s:.1f} s"
             )
 
         yield advance
@@ -209,17 +220,14 @@ def _number(value: float | None, form: str) -> str:
 
 def _bus(arguments: argparse.Namespace) -> int:
     _check_bit_rate(arguments.bitrate)
-    stopped = StopFlag()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stopped.set)
+    stopped = StopFlag.on_signals()
 
     def keep_running() -> bool:
-        orphaned = arguments.parent is not None and os.getppid() != arguments.parent
-        return not (orphaned or stopped.is_set())
+        return not (orphaned(arguments.parent) or stopped.is_set())
 
-    with Hub(Wire(arguments.bitrate), arguments.channel, virtual=False) as hub:
+    with Hub(Wire(arguments.bitrate), arguments.channel, expected=None) as hub:
         print(
-            f"hilbus channel {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True
+            f"{HUB_GREETING} {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True
         )
         hub.run_in_wall_time(keep_running)
         if hub.dropped:

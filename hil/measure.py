@@ -9,6 +9,8 @@ import numpy as np
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from firmware_py.node import EXECUTION_NS, PHASE_NS
+from firmware_py.state_machine import State
+from firmware_py.task import Fault
 from hil.bus.wire_time import classic_bits
 from hil.run.options import Recording, RunOptions
 from hil.scenario import PERIOD_S, Scenario
@@ -92,8 +94,12 @@ def result_of(
     limits = scenario.limits.get(options.controller)
     complete = not recording.ending
     within = None
-    if limits and complete and rms_mm is not None and max_mm is not None:
+    verdict = left_run(trace) if complete else ""
+    if verdict:
+        within = False
+    elif limits and complete and rms_mm is not None and max_mm is not None:
         within = rms_mm <= limits["rms_mm"] and max_mm <= limits["max_mm"]
+        verdict = "" if within else "the scenario's limits were missed"
     return {
         "scenario": scenario.name,
         "controller": options.controller,
@@ -107,6 +113,7 @@ def result_of(
         else None,
         "limits": limits,
         "within_limits": within,
+        "verdict": verdict,
         "paper": scenario.paper.get(options.controller),
         "bit_rate": options.bit_rate,
         "bus_load_percent": bus_load_percent(recording, contract, options.bit_rate),
@@ -122,12 +129,28 @@ def result_of(
     }
 
 
+def left_run(trace: Trace) -> str:
+    """Return when and why the controller was not in Run during the scenario, or nothing."""
+    state = trace.get("controller_state", np.empty(0))
+    outside = np.flatnonzero(np.isfinite(state) & (state != State.RUN))
+    if not outside.size:
+        return ""
+    first = outside[0]
+    faults = Fault(int(trace["controller_faults"][first]))
+    why = ", ".join(str(fault.name).lower() for fault in Fault if fault in faults) or "no fault"
+    state_name = State(int(state[first])).name.lower()
+    time_s = trace["time_s"][first]
+    return (
+        f"the controller was in {state_name} at {time_s:.3f} s ({why}): the errors are not those of tracking"
+    )
+
+
 def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) -> float:
     """Return the share of bus time that the frames take at `bit_rate`, the bench channel left out."""
     bench = {message.can_id for message in contract.messages if message.bench_channel}
     frames = recording.traffic.tolist()
     bits = sum(classic_bits(can_id, dlc, data) for _, can_id, dlc, data in frames if can_id not in bench)
-    return 100.0 * bits / bit_rate / recording.simulated_s
+    return 100.0 * bits / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
 
 
 def latency_us(recording: Recording, contract: Contract) -> dict[str, float] | None:

@@ -64,11 +64,6 @@ REFERENCES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "full_stroke": full_stroke,
 }
 
-NO_LOAD: Sequence[tuple[float, float]] = ()
-LOAD_STEP = ((3.0, -2000.0),)
-"""The load step (s, N) of the sine and lift_lower cases; negative helps extension."""
-FULL_STROKE_LOAD = ((7.2, -1500.0),)
-
 
 def load_profile(time_s: np.ndarray, steps: Sequence[tuple[float, float]]) -> np.ndarray:
     """Return the external load in N that steps to each force at its time."""

@@ -75,6 +75,11 @@ class OutputDirectory:
         if "error_m" in trace and len(trace["time_s"]) > 1:
             made.append(self.scratch / "picture.png")
             draw(made[-1], result, trace)
+        for old in (self.path / name for name in ("result.json", "trace.csv", "picture.png")):
+            old.unlink(missing_ok=True)
+        for old in self.path.glob("bus.*"):
+            if old.suffix in MESSAGE_WRITERS:
+                old.unlink()
         for file in made:
             os.replace(file, self.path / file.name)
         return [self.path / file.name for file in made]
@@ -129,7 +134,7 @@ def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
     for axis in axes:
         axis.grid(alpha=0.3)
         if axis.lines:
-            axis.legend(loc="upper right", fontsize="small")
+            axis.legend(loc="best", fontsize="small")
         axis.margins(x=0.01)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

@@ -75,7 +75,7 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
     name : str
         Name or path.
     duration_s : float, optional
-        Cut it short, s.
+        Length to play instead of the scenario's own, s; its limits and the paper's figures do not apply then.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{name}: {error}") from error
     if duration_s is not None:
-        content["duration_s"] = duration_s
+        content |= {"duration_s": duration_s, "limits": {}, "paper": {}}
     return _checked(path.stem, content)
 
 

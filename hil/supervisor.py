@@ -13,6 +13,8 @@ from hil.scenario import CONTROLLERS, Scenario
 BRING_UP_PERIODS = 100
 """Periods from the supervisor's start to the first one of the reference: the drive is enabled in them."""
 
+BRING_UP_S = BRING_UP_PERIODS * PERIOD_NS * 1e-9
+
 _ENABLE_PERIOD = 20
 _BRING_UP_COMMANDS = (1, 2, _ENABLE_PERIOD)
 """The first only starts the receiver's counter; the second, without Enable, arms the controller."""

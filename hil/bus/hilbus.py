@@ -53,11 +53,13 @@ class HilBus(BusABC):
         """Send a classic data frame; blocks while the hub is busy, at most `timeout` s if given."""
         try:
             packet = link.pack_frame(to_frame(msg))
-            if timeout is not None and not select.select([], [self._link], [], timeout)[1]:
-                raise can.CanTimeoutError("the hub took no frame in time")
-            self._link.send(packet)
+            ready = timeout is None or select.select([], [self._link], [], timeout)[1]
+            if ready:
+                self._link.send(packet)
         except (ValueError, OSError) as error:
             raise CanOperationError(f"cannot send on {self.channel_info}: {error}") from error
+        if not ready:
+            raise can.CanTimeoutError(f"{self.channel_info} took no frame within {timeout} s")
 
     def _recv_internal(self, timeout: float | None) -> tuple[Message | None, bool]:
         try:

@@ -1,6 +1,7 @@
 """The hub: lets other processes onto the wire, as nodes in virtual time or as ordinary bus participants."""
 
 import os
+import select
 import selectors
 import socket
 import struct
@@ -21,6 +22,9 @@ QUEUE_FRAMES = 100_000
 
 _MAX_MAIL_BYTES = 32768
 _IDLE_POLL_S = 0.2
+_LAST_FLUSH_S = 2.0
+_FRAMES_PER_SERVICE = 64
+"""Frames taken from one participant at a time; one that sends faster than the bus carries is made to wait."""
 
 
 class NodeGoneError(Exception):
@@ -118,6 +122,11 @@ class Participant:
         self.flush()
         return NOTHING
 
+    @property
+    def behind(self) -> int:
+        """Frames that wait for the program."""
+        return len(self._queue)
+
     def flush(self) -> None:
         """Send what the program has room for."""
         try:
@@ -139,8 +148,9 @@ class Hub:
         The bus the channel leads to.
     channel : str
         Name of the channel.
-    virtual : bool
-        True: nodes are answered event by event in virtual time; False: all are plain participants.
+    expected : frozenset of str or None
+        Names of the nodes that are asked event by event, in virtual time; None for wall time, in which all
+        are plain participants.
     answer_timeout_s : float
         How long a node may take to answer an event, s of wall time.
 
@@ -150,13 +160,16 @@ class Hub:
         If another hub serves the channel.
     """
 
-    def __init__(self, wire: Wire, channel: str, virtual: bool, answer_timeout_s: float = 10.0) -> None:
+    def __init__(
+        self, wire: Wire, channel: str, expected: frozenset[str] | None, answer_timeout_s: float = 10.0
+    ) -> None:
         self.wire = wire
         self.channel = channel
         self.nodes: dict[str, RemoteNode] = {}
         self.injections: list[tuple[int, Frame]] = []
         self._dropped_by_gone = 0
-        self._virtual = virtual
+        self._expected = expected
+        self._virtual = expected is not None
         self._answer_timeout_s = answer_timeout_s
         self._participants: dict[int, tuple[Port, Participant, socket.socket]] = {}
         self._strangers: dict[int, socket.socket] = {}
@@ -188,8 +201,12 @@ class Hub:
         """End all nodes and participants and remove the socket; idempotent."""
         for node in self.nodes.values():
             node.stop()
+        deadline_s = time.monotonic() + _LAST_FLUSH_S
         for _, participant, connection in self._participants.values():
-            participant.flush()
+            while participant.behind and time.monotonic() < deadline_s:
+                select.select([], [connection], [], _LAST_FLUSH_S)
+                participant.flush()
+            self._dropped_by_gone += participant.dropped + participant.behind
             connection.close()
         for connection in self._strangers.values():
             connection.close()
@@ -215,10 +232,12 @@ class Hub:
         for _, participant, _ in self._participants.values():
             participant.flush()
 
-    def run_in_wall_time(self, keep_running: Callable[[], bool]) -> None:
-        """Serve while `keep_running` says so, with bus time running as wall time does."""
-        origin_ns = time.monotonic_ns()
-        self._catch_up = lambda: self.wire.run(time.monotonic_ns() - origin_ns)
+    def run_in_wall_time(
+        self, keep_running: Callable[[], bool], clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        """Serve while `keep_running` says so, with bus time running as `clock_ns` does."""
+        origin_ns = clock_ns()
+        self._catch_up = lambda: self.wire.run(clock_ns() - origin_ns)
         while keep_running():
             self._catch_up()
             next_ns = self.wire.next_event_ns()
@@ -274,7 +293,7 @@ class Hub:
             return
         self._names += 1
         is_node = hello["role"] == "node"
-        participant = Participant(connection, hello["name"] if is_node else f"participant {self._names}")
+        participant = Participant(connection, hello["name"] if is_node else f"(participant {self._names})")
         port = self.wire.attach(participant)
         self._participants[connection.fileno()] = port, participant, connection
         self._selector.register(connection, selectors.EVENT_READ)
@@ -286,6 +305,10 @@ class Hub:
             return "the greeting is incomplete: use the same release on both sides"
         name = hello["name"] if hello["role"] == "node" else None
         taken = set(self.nodes) | {entry[1].name for entry in self._participants.values()}
+        if self._expected is not None and name is not None and name not in self._expected:
+            return f"this run has no place for a node named {name!r}"
+        if name is not None and name.startswith("("):
+            return f"a node cannot be named {name!r}"
         if name in taken:
             return f"channel {self.channel!r} has a {name} already: stop it or choose another channel"
         return None
@@ -293,15 +316,20 @@ class Hub:
     def _take(self, fd: int) -> None:
         port, participant, connection = self._participants[fd]
         try:
-            while packet := connection.recv(link.MAX_PACKET):
+            for _ in range(_FRAMES_PER_SERVICE - self.wire.waiting(port)):
+                packet = connection.recv(link.MAX_PACKET)
+                if not packet:
+                    break
                 frame = link.unpack_frame(packet)
                 if self._virtual:
                     self.injections.append((self.wire.now_ns, frame))
                 self.wire.send(port, self.wire.now_ns, frame)
+            else:
+                return
         except BlockingIOError:
             return
-        except (OSError, struct.error):
-            pass
+        except (OSError, ValueError):
+            pass  # it has gone, or sends what is no frame: cut it off
         self._selector.unregister(connection)
         self._dropped_by_gone += participant.dropped
         self.wire.detach(port)
@@ -320,18 +348,3 @@ def _is_complete(hello: dict[str, Any]) -> bool:
         and isinstance(hello.get("name"), str)
         and all(isinstance(group, list) and all(isinstance(i, int) for i in group) for group in ids)
     )
-
-
-class StopFlag:
-    """Set by a signal handler, read by loops."""
-
-    def __init__(self) -> None:
-        self._set = False
-
-    def set(self, *_: object) -> None:
-        """Ask loops to end; usable as a signal handler."""
-        self._set = True
-
-    def is_set(self) -> bool:
-        """Tell whether loops are to end."""
-        return self._set

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dbc.frame import Frame
+from dbc.frame import EFF_FLAG, Frame
 from dbc.node import Actions
 
 PROTOCOL_VERSION = 1
@@ -40,8 +40,20 @@ def pack_frame(frame: Frame) -> bytes:
 
 
 def unpack_frame(packet: bytes) -> Frame:
-    """Return the frame in a `struct can_frame`."""
-    return Frame(*_FRAME.unpack(packet))
+    """Return the frame in a `struct can_frame`.
+
+    Raises
+    ------
+    ValueError
+        If it is not a classic data frame.
+    """
+    if len(packet) != _FRAME.size:
+        raise ValueError(f"{len(packet)} bytes are no classic frame")
+    can_id, dlc, data = _FRAME.unpack(packet)
+    highest = EFF_FLAG | 0x1FFF_FFFF if can_id & EFF_FLAG else 0x7FF
+    if dlc > 8 or can_id > highest:
+        raise ValueError(f"id {can_id:#x} with {dlc} bytes is no classic data frame")
+    return Frame(can_id, dlc, data & ((1 << 8 * dlc) - 1))
 
 
 def pack_timed(time_ns: int, frame: Frame) -> bytes:
@@ -97,7 +109,10 @@ def socket_directory() -> Path:
     """
     base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     directory = Path(base) / f"hilbus-{os.getuid()}"
-    directory.mkdir(mode=0o700, exist_ok=True)
+    try:
+        directory.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise LinkError(f"cannot make {directory} ({error.strerror}): set XDG_RUNTIME_DIR") from error
     status = directory.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise LinkError(f"{directory} is not a private directory of yours: remove it or set XDG_RUNTIME_DIR")
@@ -182,9 +197,9 @@ def connect(
     try:
         send_json(link, {"version": PROTOCOL_VERSION, **hello})
         answer = receive_json(link)
-    except (LinkError, OSError):
+    except (LinkError, OSError) as error:
         link.close()
-        raise
+        raise LinkError(f"the hub on channel {channel!r} does not answer: {error}") from error
     if "error" in answer:
         link.close()
         raise LinkError(answer["error"])

@@ -137,6 +137,12 @@ class Wire:
         else:
             self._queue(now_ns, self._sequence, port, frame)
 
+    def waiting(self, port: Port) -> int:
+        """Return the number of frames that a port has handed over and that have not started."""
+        return sum(entry[4] is port for entry in self._pending) + sum(
+            entry[2] is port for entry in self._released
+        )
+
     def next_event_ns(self) -> int:
         """Return the bus time of the next event, `NEVER` if there is none."""
         arbitration_ns = max(self._idle_ns, self.now_ns) if self._pending and self._on_wire is None else NEVER

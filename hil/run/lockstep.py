@@ -14,7 +14,7 @@ from hil.bus.hub import Hub, NodeGoneError
 from hil.bus.wire import Clock, Port, Wire
 from hil.run.inprocess import make_wire, play, traffic_of
 from hil.run.node_processes import NodeProcesses, load_record
-from hil.run.options import BenchError, Recording, RunOptions
+from hil.run.options import BenchError, InterruptedRunError, Recording, RunOptions
 from hil.supervisor import Supervisor
 
 AFTERMATH_NS = 100 * PERIOD_NS
@@ -22,6 +22,7 @@ AFTERMATH_NS = 100 * PERIOD_NS
 
 _MOTOR_AT_REST_RAD_S = 0.1
 _POLL_S = 0.02
+_NODES = frozenset({"plant", "controller"})
 
 
 def run_lockstep(options: RunOptions) -> Recording:
@@ -38,7 +39,7 @@ def run_lockstep(options: RunOptions) -> Recording:
     wire = make_wire(contract, options.bit_rate)
     channel = options.channel or f"run-{os.getpid()}"
     with (
-        Hub(wire, channel, virtual=True, answer_timeout_s=options.answer_timeout_s) as hub,
+        Hub(wire, channel, expected=_NODES, answer_timeout_s=options.answer_timeout_s) as hub,
         NodeProcesses(options, "hilbus", channel) as processes,
     ):
         _wait_for_nodes(hub, processes, options)
@@ -61,21 +62,21 @@ def run_lockstep(options: RunOptions) -> Recording:
                 _run_without(error, wire, ports)
             wall_s = time.perf_counter() - ready_s
         simulated_s = wire.now_ns / 1e9
-        notes: dict[str, object] = {
-            "exchanges_per_period": sum(node.exchanges for node in hub.nodes.values())
-            * PERIOD_NS
-            / wire.now_ns,
-            "listener_drops": hub.dropped,
-            "injected_frames": len(hub.injections),
-        }
+        exchanges = sum(node.exchanges for node in hub.nodes.values())
         hub.close()
         processes.wait()
+        notes: dict[str, object] = {
+            "exchanges_per_period": exchanges * PERIOD_NS / wire.now_ns,
+            "listener_drops": hub.dropped,
+            "injections": [(time_ns / 1e9, *frame) for time_ns, frame in hub.injections],
+        }
     plant, controller = (load_record(options, name) for name in ("plant", "controller"))
     if gone is not None:
         at = f"{gone} at bus time {gone_ns / 1e9:.3f} s"
         if gone.silent:
             raise BenchError(f"{at}: see why it hangs, or raise --answer-timeout")
         ending = f"{at}{processes.exit_code(gone.name)}{_motor_stop(plant, gone_ns)}"
+    ending = ending or processes.failure()
     return Recording(
         traffic=traffic_of(wire),
         supervisor=supervisor.record.columns_by_name(),
@@ -86,17 +87,17 @@ def run_lockstep(options: RunOptions) -> Recording:
         wall_s=wall_s,
         startup_s=ready_s - begin_s,
         ending=ending,
-        broken=gone is not None,
+        broken=gone is not None or bool(processes.failure()),
         notes=notes,
     )
 
 
 def _wait_for_nodes(hub: Hub, processes: NodeProcesses, options: RunOptions) -> None:
     deadline_s = time.monotonic() + options.start_timeout_s
-    while missing := sorted({"plant", "controller"} - set(hub.nodes)):
+    while missing := sorted(_NODES - set(hub.nodes)):
         processes.check()
         if options.stopped.is_set():
-            raise BenchError("interrupted during start-up")
+            raise InterruptedRunError("interrupted during start-up")
         if time.monotonic() > deadline_s:
             raise BenchError(
                 f"the {missing[0]} process did not come up within {options.start_timeout_s:g} s: "

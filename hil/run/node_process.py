@@ -1,7 +1,6 @@
 """The command line and main loop that every node process shares."""
 
 import argparse
-import os
 import signal
 import socket
 import sys
@@ -18,10 +17,10 @@ from dbc.node import Actions, Node
 from dbc.record import Record
 from hil.bus import link
 from hil.bus.hilbus import HilBus
-from hil.bus.hub import StopFlag
 from hil.bus.link import LinkError
 from hil.bus.wire import Clock
 from hil.run.realtime import DuplicateNodeError, RealtimeNode
+from hil.run.stopping import StopFlag, orphaned
 
 EXIT_USAGE = 2
 EXIT_BROKEN = 3
@@ -113,7 +112,7 @@ def _open_bus(arguments: argparse.Namespace) -> can.BusABC:
     given = {key: getattr(arguments, key) for key in ("interface", "channel", "bitrate")}
     try:
         return can.Bus(**{key: value for key, value in given.items() if value is not None})
-    except (can.CanError, OSError, ValueError) as error:
+    except (can.CanError, OSError, ValueError, TypeError) as error:
         where = f"{arguments.interface or 'the configured interface'} channel {arguments.channel!r}"
         raise can.CanInitializationError(f"cannot open {where} ({error}): check -i and -c") from error
 
@@ -169,12 +168,10 @@ def _hello(node: Node) -> dict[str, object]:
 def _run_in_wall_time(
     node: RecordingNode, bus: can.BusABC, arguments: argparse.Namespace, clock: Clock
 ) -> None:
-    stopped = StopFlag()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stopped.set)
+    stopped = StopFlag.on_signals()
 
     def keep_running() -> bool:
-        if arguments.parent is not None and os.getppid() != arguments.parent:
+        if orphaned(arguments.parent):
             raise LinkError("the bench that started this process has ended")
         return not stopped.is_set()
 

@@ -67,7 +67,7 @@ class NodeProcesses:
         """
         for name, process in self._processes.items():
             if process.poll() is not None:
-                words = self.last_words(name) or "it said nothing"
+                words = self.last_words(name) or "silently"
                 raise BenchError(f"the {name} process ended{self.exit_code(name)}: {words}")
 
     def exit_code(self, name: str) -> str:
@@ -79,6 +79,15 @@ class NodeProcesses:
         """Return the last line a process wrote to its standard error."""
         said = self._logs[name].read_text(errors="replace").strip().splitlines()
         return said[-1] if said else ""
+
+    def failure(self) -> str:
+        """Return what went wrong after both have ended, or nothing."""
+        for name, process in self._processes.items():
+            if process.poll() not in (0, None):
+                return (
+                    f"the {name} process ended{self.exit_code(name)}: {self.last_words(name) or 'silently'}"
+                )
+        return ""
 
     def terminate(self) -> None:
         """Ask both to end."""

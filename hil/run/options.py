@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.bus.hub import StopFlag
+from hil.run.stopping import StopFlag
 from hil.scenario import Scenario
 
 DEFAULT_BIT_RATE = 1_000_000
@@ -15,8 +15,16 @@ INTERRUPTED = "interrupted"
 """`Recording.ending` of a run that was asked to stop."""
 
 
+HUB_GREETING = "hilbus channel"
+"""What a hub process says first when it serves."""
+
+
 class BenchError(Exception):
     """The run cannot start: the message says what is wrong and what to do."""
+
+
+class InterruptedRunError(BenchError):
+    """The run was asked to stop before it began."""
 
 
 @dataclass(frozen=True, slots=True)

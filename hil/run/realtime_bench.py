@@ -16,7 +16,7 @@ from dbc.node import PERIOD_NS
 from hil.bus.messages import to_frame
 from hil.bus.wire import Clock
 from hil.run.node_processes import NodeProcesses, load_record
-from hil.run.options import INTERRUPTED, BenchError, Recording, RunOptions
+from hil.run.options import HUB_GREETING, INTERRUPTED, BenchError, InterruptedRunError, Recording, RunOptions
 from hil.run.realtime import RealtimeNode
 from hil.supervisor import Supervisor
 
@@ -38,8 +38,8 @@ def run_realtime(options: RunOptions) -> Recording:
     contract = Contract.load(options.dbc)
     supervisor = Supervisor(contract, options.scenario, options.controller)
     with _bus_to_use(options) as (interface, channel):
-        listener = _open(interface, channel)
-        own = _open(interface, channel)
+        listener = _open(interface, channel, options.bit_rate)
+        own = _open(interface, channel, options.bit_rate)
         with listener, own, NodeProcesses(options, interface, channel) as processes:
             heard: list[tuple[int, can.Message]] = []
             _wait_for_both(listener, contract, processes, options)
@@ -51,10 +51,11 @@ def run_realtime(options: RunOptions) -> Recording:
             broken = ""
             try:
                 runner.run(_until_done(supervisor, processes, options))
-            except BenchError as error:
+            except (BenchError, can.CanError, OSError) as error:
                 broken = str(error)
-            wall_s = time.perf_counter() - ready_s
-            notifier.stop()
+            finally:
+                wall_s = time.perf_counter() - ready_s
+                notifier.stop()
             processes.terminate()
             processes.wait()
             notes: dict[str, object] = {
@@ -63,6 +64,7 @@ def run_realtime(options: RunOptions) -> Recording:
             }
     record = supervisor.record.columns_by_name()
     played_ns = int(record["time_ns"][-1] - record["time_ns"][0]) + PERIOD_NS if len(record["time_ns"]) else 0
+    broken = broken or processes.failure()
     ending = broken or (INTERRUPTED if options.stopped.is_set() else "")
     return Recording(
         traffic=_traffic(heard, options.rt_ratio),
@@ -99,17 +101,17 @@ def _bus_to_use(options: RunOptions) -> Iterator[tuple[str, str]]:
     try:
         assert hub.stdout is not None
         said = hub.stdout.readline().decode(errors="replace").strip()
-        if hub.poll() is not None:
-            raise BenchError(f"the hub process ended at once: {said}")
+        if not said.startswith(HUB_GREETING):
+            raise BenchError(said.removeprefix("hil: "))
         yield "hilbus", channel
     finally:
         hub.terminate()
         hub.wait()
 
 
-def _open(interface: str, channel: str) -> can.BusABC:
+def _open(interface: str, channel: str, bit_rate: int) -> can.BusABC:
     try:
-        return can.Bus(interface=interface, channel=channel)
+        return can.Bus(interface=interface, channel=channel, bitrate=bit_rate)
     except (can.CanError, OSError, ValueError) as error:
         raise BenchError(f"cannot open {interface} channel {channel!r}: {error}") from error
 
@@ -125,7 +127,7 @@ def _wait_for_both(
     while waiting_for:
         processes.check()
         if options.stopped.is_set():
-            raise BenchError("interrupted during start-up")
+            raise InterruptedRunError("interrupted during start-up")
         if time.monotonic() > deadline_s:
             missing = next(iter(waiting_for.values()))
             raise BenchError(

@@ -1,6 +1,6 @@
 """Helpers of the controller's tests: the kernel on its two machines, and the closed loop step by step."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -10,8 +10,9 @@ import numpy as np
 from firmware_py import checked
 from firmware_py.calibration import Calibration
 from firmware_py.kernel import layout as k
-from hil import references
 from hil.closed_loop import PERIOD_S, RAD_S_PER_COUNT, SUBSTEPS
+from hil.references import load_profile, setpoint_counts
+from hil.scenario import load_scenario
 from plant_sim.equilibrium import initial_state
 from plant_sim.integrator import advance
 from plant_sim.layout import POSITION
@@ -23,24 +24,19 @@ Controller = Callable[[int, int], int]
 
 @dataclass(frozen=True)
 class Case:
-    """A reference and its load."""
+    """Reference and load of a scenario."""
 
     setpoint: np.ndarray
     load_n: np.ndarray
 
 
-def make_case(reference: str, duration_s: float, load: Sequence[tuple[float, float]]) -> Case:
-    time_s = np.arange(round(duration_s / PERIOD_S)) * PERIOD_S
-    metres = references.REFERENCES[reference](time_s)
-    return Case(references.setpoint_counts(metres), references.load_profile(time_s, load))
+def make_case(name: str) -> Case:
+    scenario = load_scenario(name)
+    time_s = np.arange(scenario.periods) * PERIOD_S
+    return Case(setpoint_counts(scenario.reference_m()), load_profile(time_s, scenario.load))
 
 
-CASES = {
-    "sine": make_case("sine", 10.0, references.NO_LOAD),
-    "sine_load": make_case("sine", 10.0, references.LOAD_STEP),
-    "lift_lower": make_case("lift_lower", 10.5, references.NO_LOAD),
-    "lift_lower_load": make_case("lift_lower", 10.5, references.LOAD_STEP),
-}
+CASES = {name: make_case(name) for name in ("sine", "sine_load", "lift_lower", "lift_lower_load")}
 
 
 class CheckedController:

@@ -7,8 +7,9 @@ from kernel_runs import CASES, CheckedController, make_case, step_through
 
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import ADRC, PI_STAR, LimiterTuning, Tuning
-from hil import references
 from hil.closed_loop import PERIOD_S, run_closed_loop
+from hil.scenario import builtin_names, load_scenario
+from plant_sim.parameters import PlantParameters
 
 NOMINAL = Tuning().calibration()
 
@@ -39,12 +40,6 @@ DESIGN_FIGURES = {
         "lift_lower_load": (0.325, 1.634),
     },
 }
-GATES = {
-    "sine": (0.10, 0.25),
-    "sine_load": (0.20, 1.45),
-    "lift_lower": (0.35, 1.6),
-    "lift_lower_load": (0.45, 2.1),
-}
 TUNINGS = {
     "p": Tuning(law=k.LAW_P),
     "pi": Tuning(law=k.LAW_PI),
@@ -53,13 +48,32 @@ TUNINGS = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_adrc_meets_its_gate(case):
-    run = run_closed_loop(NOMINAL, CASES[case].setpoint, CASES[case].load_n)
-    rms_mm, max_mm = GATES[case]
+def gate(scenario):
+    """RMS and maximum that ADRC must keep, mm."""
+    limits = load_scenario(scenario).limits["adrc"]
+    return limits["rms_mm"], limits["max_mm"]
+
+
+@pytest.mark.parametrize("scenario", builtin_names())
+def test_adrc_meets_its_gate(scenario):
+    case = make_case(scenario)
+    run = run_closed_loop(NOMINAL, case.setpoint, case.load_n)
+    rms_mm, max_mm = gate(scenario)
     assert run.rms_mm < rms_mm
     assert run.max_mm < max_mm
     assert run.saturations == 0
+
+
+@pytest.mark.parametrize(("factor", "figures"), [(1 / 2, (0.247, 0.957)), (1 / 3, (0.80, 2.80))])
+def test_adrc_misses_its_gate_when_the_oil_is_softer(factor, figures):
+    """The known weakness of this tuning."""
+    case = CASES["sine"]
+    softer = PlantParameters().scaled(bulk_modulus=factor)
+    run = run_closed_loop(NOMINAL, case.setpoint, case.load_n, parameters=softer)
+    assert (run.rms_mm, run.max_mm) == pytest.approx(figures, rel=0.05)
+    rms_mm, max_mm = gate("sine")
+    assert run.rms_mm > rms_mm
+    assert run.max_mm > max_mm
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -97,14 +111,6 @@ def test_the_interpreted_kernel_never_overflows_and_drives_the_same_positions(ca
     assert np.array_equal(positions, run.position_m)
 
 
-def test_full_stroke_stays_in_range():
-    case = make_case("full_stroke", 15.0, references.FULL_STROKE_LOAD)
-    run = run_closed_loop(NOMINAL, case.setpoint, case.load_n)
-    assert run.rms_mm < 0.15
-    assert run.max_mm < 0.8
-    assert run.saturations == 0
-
-
 def test_states_use_the_bits_they_were_scaled_for():
     peaks = np.zeros(k.ST_SIZE, np.int64)
     for case in CASES.values():
@@ -134,7 +140,7 @@ def test_the_limiter_tames_a_setpoint_step_of_50_mm(from_mm):
 def test_more_delay_tracks_worse_and_still_meets_the_gate():
     case = CASES["sine"]
     one, two = (run_closed_loop(NOMINAL, case.setpoint, case.load_n, delay_periods=n) for n in (1, 2))
-    assert one.rms_mm < two.rms_mm < GATES["sine"][0]
+    assert one.rms_mm < two.rms_mm < gate("sine")[0]
 
 
 def test_hold_periods_come_before_the_first_row():

@@ -14,11 +14,12 @@ from threading import Thread
 from typing import Any
 
 from dbc.contract import Contract
-from hil.bus.hub import Hub, StopFlag
+from hil.bus.hub import Hub
 from hil.bus.wire import Wire
 from hil.measure import Trace, result_of, trace_of
 from hil.run.inprocess import run_inprocess
 from hil.run.options import Recording, RunOptions
+from hil.run.stopping import StopFlag
 from hil.scenario import Scenario, load_scenario
 
 SAFETY_NET_S = 120.0
@@ -96,7 +97,7 @@ def wait_until(happened: Callable[[], Any], what: str) -> Any:
 def serving(channel: str) -> Iterator[Hub]:
     """Serve a bus in wall time from a thread."""
     stopped = StopFlag()
-    with Hub(Wire(1_000_000), channel, virtual=False) as hub:
+    with Hub(Wire(1_000_000), channel, expected=None) as hub:
         server = Thread(target=hub.run_in_wall_time, args=(lambda: not stopped.is_set(),))
         server.start()
         try:

@@ -131,7 +131,7 @@ def test_after_a_loss_the_others_play_on_for_a_tenth_of_a_second_of_bus_time():
 
 def test_a_hub_that_vanishes_ends_a_node_at_once_with_one_line():
     """No timer is involved: the node's socket reports the end."""
-    hub = Hub(Wire(1_000_000), "test", virtual=True)
+    hub = Hub(Wire(1_000_000), "test", expected=frozenset({"plant", "controller"}))
     with background("plant_sim", "-i", "hilbus", "-c", "test") as plant:
         wait_until(lambda: hub.service(0.01) or hub.nodes, "the plant says hello")
         for node in hub.nodes.values():
@@ -254,7 +254,7 @@ def test_losing_the_bench_ends_both_sides(bench, record_property):
     bench.process.kill()
     bench.wait_until_all_is_gone()
     record_property("seconds_to_the_end", round(time.monotonic() - begin_s, 2))
-    with Hub(Wire(1_000_000), "watched", virtual=False):
+    with Hub(Wire(1_000_000), "watched", expected=None):
         pass  # the socket it could not remove is in nobody's way
 
 
@@ -312,4 +312,4 @@ def test_a_run_interrupted_while_its_sides_start_leaves_nothing(tmp_path):
     assert said.count("\n") == 1
     assert "interrupted" in said
     assert not list(link.socket_directory().iterdir())
-    assert not list(out.glob(".unfinished-*")) if out.exists() else True
+    assert not list(out.glob(".unfinished-*"))
