@@ -29,7 +29,7 @@ class Status(IntEnum):
     WRONGSEQUENCE = 0x40
 
 
-ACCEPTED = frozenset({Status.OK, Status.OKSOMELOST, Status.SYNC})
+ACCEPTED = (int(Status.OK), int(Status.OKSOMELOST), int(Status.SYNC))
 """Statuses whose data may be used (``E2E_P02MapStatusToSM`` with the R4.2 profile behaviour)."""
 
 

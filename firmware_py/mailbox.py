@@ -43,7 +43,6 @@ FIELDS = (
 FIELD_SIZE = 5
 EXPECTATION_SIZE = FIELDS + MAX_FIELDS * FIELD_SIZE
 
-_USABLE = (int(e2e.Status.OK), int(e2e.Status.OKSOMELOST), int(e2e.Status.SYNC))
 _FIRST = int(e2e.Status.INITIAL)
 
 
@@ -106,17 +105,17 @@ def _take_values(mailbox, expected):  # type: ignore[no-untyped-def]
 
 @register_jitable
 def poll(mailbox, expected):  # type: ignore[no-untyped-def]
-    """Check what arrived since the last period. A frame of a wrong length counts as none."""
+    """Check what arrived since the last period. A frame of a wrong length is none to the E2E check."""
     arrived = mailbox[ARRIVED] and mailbox[LENGTH] == expected[e2e.DLC]
     mailbox[IS_NEW] = 0
     mailbox[AGE] += 1
-    if arrived or mailbox[ARRIVED] or mailbox[AGE] % expected[CYCLE_PERIODS] == 0:
+    if mailbox[ARRIVED] or mailbox[AGE] % expected[CYCLE_PERIODS] == 0:
         status = e2e.profile2_check(
             mailbox[: e2e.STATE_SIZE], expected[: e2e.CONFIGURATION_SIZE], np.uint64(mailbox[DATA]), arrived
         )
         if mailbox[ARRIVED]:
-            mailbox[CORRUPT] = status not in _USABLE and status != _FIRST
-        if status in _USABLE:
+            mailbox[CORRUPT] = status not in e2e.ACCEPTED and status != _FIRST
+        if status in e2e.ACCEPTED:
             _take_values(mailbox, expected)
     mailbox[ARRIVED] = 0
     mailbox[STALE] = mailbox[AGE] >= STALE_CYCLES * expected[CYCLE_PERIODS]

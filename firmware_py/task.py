@@ -27,7 +27,7 @@ from firmware_py.state_machine import (
 (FEEDBACK, SETPOINT, COMMAND, DRIVE_STATUS) = range(4)
 
 # their signals
-SENSOR_STATUS, FEEDBACK_POSITION = VALUES, VALUES + 1
+FEEDBACK_POSITION = VALUES + 1
 SETPOINT_POSITION = VALUES
 COMMAND_ENABLE, COMMAND_LAW, COMMAND_FAULT_RESET = VALUES, VALUES + 1, VALUES + 2
 STATUSWORD = VALUES
@@ -35,7 +35,7 @@ STATUSWORD = VALUES
 # task words
 (
     STATE,
-    FAULTS,  # Fault bits: what is wrong now; in the safe state also what led there
+    FAULTS,  # Fault bits: what is wrong now and any overrun since power-on; in the safe state what led there
     IS_CALIBRATED,
     DEFAULT_LAW,
     ARMED,  # whether a command without Enable came since power-on or the last fault

@@ -134,8 +134,8 @@ class Plant:
             sends.append((now_ns, status.frame(payload)))
         elif phase == _PRESSURE_PHASE:
             pressure = contract.pressure_feedback
-            counts3 = map(pressure_count, row[PRESSURE_A : PRESSURE_ACCUMULATOR + 1])
-            sends.append((now_ns, pressure.frame(pressure.pack(*counts3))))
+            pressures_0p01bar = map(pressure_count, row[PRESSURE_A : PRESSURE_ACCUMULATOR + 1])
+            sends.append((now_ns, pressure.frame(pressure.pack(*pressures_0p01bar))))
         return Actions(self._time_ns + PERIOD_NS, tuple(sends))
 
     def _restart(self, position_m: float) -> None:

@@ -44,7 +44,6 @@ COLUMNS = (
 # what the drive expects of DriveCommand: the receiver's E2E configuration, then where its signals lie
 _CONTROLWORD_START = e2e.CONFIGURATION_SIZE
 _TARGET_START = e2e.CONFIGURATION_SIZE + 1
-_ACCEPTED = (int(e2e.Status.OK), int(e2e.Status.OKSOMELOST), int(e2e.Status.SYNC))
 
 
 def expectation(message: MessageCodec[..., DriveCommand]) -> np.ndarray:
@@ -91,5 +90,5 @@ def run_period(state, parameters, row, periods, drive, receiver, expected, data,
     payload = np.int64(data)
     controlword = (payload >> expected[_CONTROLWORD_START]) & 0xFFFF
     target = (((payload >> expected[_TARGET_START]) & 0xFFFF) ^ 0x8000) - 0x8000
-    row[SPEED_COMMAND] = drive_step(drive, controlword, target, status in _ACCEPTED)
+    row[SPEED_COMMAND] = drive_step(drive, controlword, target, status in e2e.ACCEPTED)
     row[DRIVE_STATE] = drive[STATE]
