@@ -90,6 +90,16 @@ class MessageCodec(Generic[P, T]):
         """Return what `dbc.e2e.profile2_check` needs to know of this (protected) message."""
         return receiver_configuration(self._protected_ids(), self.dlc)
 
+    def protected_layout(self) -> np.ndarray:
+        """Return what compiled code needs to send or receive this (protected) message.
+
+        Returns
+        -------
+        ndarray of int64, shape (dbc.e2e.CONFIGURATION_SIZE + fields,)
+            The E2E configuration, then the start bit of each field.
+        """
+        return np.array([*self.receiver_configuration(), *(field.start for field in self.fields)], np.int64)
+
     def _protected_ids(self) -> tuple[int, ...]:
         if self.data_ids is None:
             raise ValueError(f"message {self.name} is not E2E protected")

@@ -28,6 +28,10 @@ class Record:
         """Append a row of the record's own type."""
         self._cells.frombytes(row.tobytes())
 
+    def clear(self) -> None:
+        """Forget all rows."""
+        del self._cells[:]
+
     def amend(self, column: str, value: float) -> None:
         """Change a cell of the last row; do nothing before the first one."""
         if self._cells:

@@ -73,7 +73,7 @@ class Controller:
             message.can_id
             for message in (contract.drive_command, contract.controller_status, contract.observer_state)
         )
-        self._layout = task.command_layout(contract.drive_command)
+        self._layout = contract.drive_command.protected_layout()
         self._row = np.zeros(len(task.RECORD_COLUMNS), np.int64)
         self.record = Record(task.RECORD_COLUMNS, "q")
 

@@ -6,9 +6,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from dbc import e2e
-from dbc.codec import MessageCodec
 from dbc.jit import njit
-from dbc.messages import DriveCommand
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
 from firmware_py.mailbox import CORRUPT, INVALID, IS_NEW, OVERRUNS, STALE, VALUES, poll
@@ -65,7 +63,7 @@ RECORD_COLUMNS = (
 )
 _RECORD_KERNEL_STATE = RECORD_COLUMNS.index("v1")
 
-# what the task knows of DriveCommand: the sender's E2E configuration, then where its signals lie
+# where DriveCommand's layout says where its signals lie
 _CONTROLWORD_START = e2e.CONFIGURATION_SIZE
 _VELOCITY_START = e2e.CONFIGURATION_SIZE + 1
 
@@ -203,12 +201,6 @@ def _controlword(statusword, task, conditions):  # type: ignore[no-untyped-def]
     return DISABLE_VOLTAGE
 
 
-def command_layout(message: MessageCodec[..., DriveCommand]) -> np.ndarray:
-    """Return what `period` needs to know of DriveCommand."""
-    controlword, target_velocity = message.fields
-    return np.array([*message.receiver_configuration(), controlword.start, target_velocity.start], np.int64)
-
-
 @njit(
     "uint64(int64[:,::1], int64[:,::1], int64[::1], int64[::1], int32[::1], int32[::1], int32[::1],"
     " int64[::1], int64)",
@@ -228,7 +220,7 @@ def period(mailboxes, expectations, layout, task, calibration, state, io, record
     mailboxes, expectations : array of int64, a row for each mailbox
         See `firmware_py.mailbox`.
     layout : array of int64
-        From `command_layout`.
+        DriveCommand's, from `dbc.codec.MessageCodec.protected_layout`.
     task : array of int64, shape (TASK_SIZE,)
         State of the task, updated in place.
     calibration, state, io : array of int32

@@ -18,11 +18,9 @@ from plant_sim.period import (
     COLUMNS,
     LOAD,
     MOTOR_SPEED,
-    POSITION,
     PRESSURE_A,
     PRESSURE_ACCUMULATOR,
     TIME,
-    expectation,
     run_period,
 )
 from plant_sim.sensors import PositionSensor, pressure_count
@@ -33,7 +31,6 @@ _PRESSURE_PHASE = 4
 _COUNTS_PER_RAD_S = 30.0 * COUNTS_PER_RPM / math.pi
 _RESET_LSB_M = 1e-7
 _MAX_LOAD_N = 1e6
-_SENSOR_OK = 0
 _run_period = entry_point(run_period)
 
 
@@ -77,18 +74,22 @@ class Plant:
             message.can_id
             for message in (contract.position_feedback, contract.drive_status, contract.pressure_feedback)
         )
-        self._expected = expectation(contract.drive_command)
+        self._command_layout = contract.drive_command.protected_layout()
+        self._feedback_layout = contract.position_feedback.protected_layout()
+        self._feedback = contract.position_feedback
+        self._command_dlc = contract.drive_command.dlc
         self.record = Record(COLUMNS, "d")
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: at rest, retracted, drive off."""
         contract = self._contract
         self._receiver = np.zeros(e2e.STATE_SIZE, np.int64)
-        self._protect_position = contract.position_feedback.protector().protect
+        self._feedback_counter = np.zeros(1, np.int64)
         self._protect_status = contract.drive_status.protector().protect
         self._command_frame: Frame | None = None
         self._bench_frames: dict[int, Frame] = {}
         self._time_ns = next_period(now_ns)
+        self._sensor.restart()
         self._restart(0.0)
         return Actions(self._time_ns)
 
@@ -102,41 +103,45 @@ class Plant:
 
     def on_timer(self, now_ns: int) -> Actions:
         """Simulate up to now, send what the sensors say, and let the drive take its command."""
-        contract = self._contract
         if self._bench_frames:
             self._take_bench_frames()
         periods = (now_ns - self._time_ns) // PERIOD_NS
         self._time_ns += periods * PERIOD_NS
         frame, self._command_frame = self._command_frame, None
-        arrived = frame is not None and frame.dlc == contract.drive_command.dlc
-        _run_period(
+        arrived = frame is not None and frame.dlc == self._command_dlc
+        payload = _run_period(
             self._state,
             self._vector,
             self._row,
             periods,
             self._drive.words,
             self._receiver,
-            self._expected,
+            self._command_layout,
             frame.data if frame is not None else 0,
             arrived,
+            self._feedback_counter,
+            self._feedback_layout,
+            self._sensor.lsb_um,
+            self._sensor.noise_m(),
         )
         self.record.append_array(self._row)
-        row = self._row.tolist()
-
-        feedback = contract.position_feedback
-        payload = self._protect_position(feedback.pack(_SENSOR_OK, self._sensor.read(row[POSITION])))
-        sends = [(now_ns, feedback.frame(payload))]
+        sends = [(now_ns, self._feedback.frame(payload))]
         phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
         if phase == _STATUS_PHASE:
-            status = contract.drive_status
-            counts = round(row[MOTOR_SPEED] * _COUNTS_PER_RAD_S)
-            payload = self._protect_status(status.pack(self._drive.statusword, counts))
-            sends.append((now_ns, status.frame(payload)))
+            sends.append((now_ns, self._status_frame()))
         elif phase == _PRESSURE_PHASE:
-            pressure = contract.pressure_feedback
-            pressures_0p01bar = map(pressure_count, row[PRESSURE_A : PRESSURE_ACCUMULATOR + 1])
-            sends.append((now_ns, pressure.frame(pressure.pack(*pressures_0p01bar))))
+            sends.append((now_ns, self._pressure_frame()))
         return Actions(self._time_ns + PERIOD_NS, tuple(sends))
+
+    def _status_frame(self) -> Frame:
+        status = self._contract.drive_status
+        counts = round(float(self._row[MOTOR_SPEED]) * _COUNTS_PER_RAD_S)
+        return status.frame(self._protect_status(status.pack(self._drive.statusword, counts)))
+
+    def _pressure_frame(self) -> Frame:
+        pressure = self._contract.pressure_feedback
+        pressures_pa = self._row[PRESSURE_A : PRESSURE_ACCUMULATOR + 1].tolist()
+        return pressure.frame(pressure.pack(*map(pressure_count, pressures_pa)))
 
     def _restart(self, position_m: float) -> None:
         self._state = initial_state(self._parameters, position_m)

@@ -3,14 +3,13 @@
 import numpy as np
 
 from dbc import e2e
-from dbc.codec import MessageCodec
 from dbc.jit import njit
-from dbc.messages import DriveCommand
 from dbc.node import PERIOD_NS
 from plant_sim import layout as at
 from plant_sim.drive import STATE, drive_step
 from plant_sim.hydraulics import accumulator_pressure
 from plant_sim.integrator import advance
+from plant_sim.sensors import quantised_um
 
 SUBSTEPS = 10
 PERIOD_S = PERIOD_NS * 1e-9
@@ -41,24 +40,34 @@ COLUMNS = (
 ) = range(10)
 """Indices of a row: the state at its period's start, and what acts during it."""
 
-# what the drive expects of DriveCommand: the receiver's E2E configuration, then where its signals lie
-_CONTROLWORD_START = e2e.CONFIGURATION_SIZE
-_TARGET_START = e2e.CONFIGURATION_SIZE + 1
+# where the layouts of DriveCommand and PositionFeedback say where their signals lie
+_CONTROLWORD_START, _TARGET_START = e2e.CONFIGURATION_SIZE, e2e.CONFIGURATION_SIZE + 1
+_SENSOR_STATUS_START, _POSITION_START = e2e.CONFIGURATION_SIZE, e2e.CONFIGURATION_SIZE + 1
 
-
-def expectation(message: MessageCodec[..., DriveCommand]) -> np.ndarray:
-    """Return what `run_period` needs to know of DriveCommand."""
-    controlword, target_velocity = message.fields
-    return np.array([*message.receiver_configuration(), controlword.start, target_velocity.start], np.int64)
+_SENSOR_OK = 0
 
 
 @njit(
-    "void(float64[::1], float64[::1], float64[::1], int64,"
-    " int64[::1], int64[::1], int64[::1], uint64, int64)",
+    "uint64(float64[::1], float64[::1], float64[::1], int64,"
+    " int64[::1], int64[::1], int64[::1], uint64, int64, int64[::1], int64[::1], int64, float64)",
     depends=("dbc.e2e", "plant_sim"),
 )
-def run_period(state, parameters, row, periods, drive, receiver, expected, data, arrived):  # type: ignore[no-untyped-def]
-    """Advance the plant, then let the drive take its newest command.
+def run_period(  # type: ignore[no-untyped-def]
+    state,
+    parameters,
+    row,
+    periods,
+    drive,
+    receiver,
+    command,
+    data,
+    arrived,
+    counter,
+    feedback,
+    lsb_um,
+    noise_m,
+):
+    """Advance the plant, let the drive take its newest command, and return PositionFeedback's payload.
 
     Parameters
     ----------
@@ -72,10 +81,14 @@ def run_period(state, parameters, row, periods, drive, receiver, expected, data,
         See `plant_sim.drive`.
     receiver : array of int64, shape (e2e.STATE_SIZE,)
         E2E state of DriveCommand.
-    expected : array of int64
-        From `expectation`.
+    command, feedback : array of int64
+        Layouts of DriveCommand and PositionFeedback, from `dbc.codec.MessageCodec.protected_layout`.
     data, arrived : int
         Payload of the newest DriveCommand; 0 if none arrived since the last call.
+    counter : array of int64, shape (1,)
+        E2E counter of PositionFeedback.
+    lsb_um, noise_m : int, float
+        The position sensor's resolution, and its error in this period.
     """
     row[TIME] += periods * PERIOD_NS
     for _ in range(periods):
@@ -86,9 +99,13 @@ def run_period(state, parameters, row, periods, drive, receiver, expected, data,
     row[PRESSURE_B] = state[at.PRESSURE_B]
     row[PRESSURE_ACCUMULATOR] = accumulator_pressure(state[at.OIL_VOLUME], parameters)
     row[MOTOR_SPEED] = state[at.MOTOR_SPEED]
-    status = e2e.profile2_check(receiver, expected[: e2e.CONFIGURATION_SIZE], data, arrived)
+    status = e2e.profile2_check(receiver, command[: e2e.CONFIGURATION_SIZE], data, arrived)
     payload = np.int64(data)
-    controlword = (payload >> expected[_CONTROLWORD_START]) & 0xFFFF
-    target = (((payload >> expected[_TARGET_START]) & 0xFFFF) ^ 0x8000) - 0x8000
+    controlword = (payload >> command[_CONTROLWORD_START]) & 0xFFFF
+    target = (((payload >> command[_TARGET_START]) & 0xFFFF) ^ 0x8000) - 0x8000
     row[SPEED_COMMAND] = drive_step(drive, controlword, target, status in e2e.ACCEPTED)
     row[DRIVE_STATE] = drive[STATE]
+    position_um = quantised_um(state[at.POSITION] + noise_m, lsb_um)
+    reading = _SENSOR_OK << feedback[_SENSOR_STATUS_START]
+    reading |= (position_um & 0xFFFF_FFFF) << feedback[_POSITION_START]
+    return e2e.profile2_protect(counter, feedback[: e2e.CONFIGURATION_SIZE], np.uint64(reading))

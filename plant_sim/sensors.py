@@ -4,8 +4,17 @@ import math
 
 import numpy as np
 
+from dbc.jit import njit
+
 _POSITION_UNIT_M = 1e-6
 _PRESSURE_UNIT_PA = 1000.0
+
+
+@njit("int64(float64, int64)")
+def quantised_um(position_m, lsb_um):  # type: ignore[no-untyped-def]
+    """Return a position as a signed 32-bit count of 1 µm (nearest step of `lsb_um`, half up, saturating)."""
+    steps = math.floor(position_m / (lsb_um * _POSITION_UNIT_M) + 0.5)
+    return min(max(np.int64(steps) * lsb_um, -(2**31)), 2**31 - 1)
 
 
 class PositionSensor:
@@ -20,6 +29,11 @@ class PositionSensor:
     seed : int
         Of the noise; equal seeds give equal noise.
 
+    Attributes
+    ----------
+    lsb_um : int
+        Resolution, µm.
+
     Raises
     ------
     ValueError
@@ -32,16 +46,22 @@ class PositionSensor:
             raise ValueError(f"lsb_m is {lsb_m!r}, must be a whole number of micrometres")
         if not (math.isfinite(noise_rms_m) and noise_rms_m >= 0.0):
             raise ValueError(f"noise_rms_m is {noise_rms_m!r}, must be zero or positive")
-        self._lsb_um = lsb_um
+        self.lsb_um = lsb_um
         self._noise_rms_m = noise_rms_m
-        self._random = np.random.default_rng(seed)
+        self._seed = seed
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin the noise anew."""
+        self._random = np.random.default_rng(self._seed)
+
+    def noise_m(self) -> float:
+        """Return the error of the next reading before quantisation, m."""
+        return self._noise_rms_m * self._random.standard_normal() if self._noise_rms_m else 0.0
 
     def read(self, position_m: float) -> int:
-        """Return the position as a signed 32-bit count of 1 µm (nearest step, half up, saturating)."""
-        if self._noise_rms_m > 0.0:
-            position_m += self._noise_rms_m * self._random.standard_normal()
-        steps = math.floor(position_m / (self._lsb_um * _POSITION_UNIT_M) + 0.5)
-        return min(max(steps * self._lsb_um, -(2**31)), 2**31 - 1)
+        """Return a position with its noise as `quantised_um` does."""
+        return int(quantised_um(position_m + self.noise_m(), self.lsb_um))
 
 
 def pressure_count(pressure_pa: float) -> int:

@@ -1,26 +1,28 @@
 """The hub: lets other processes onto the wire, as nodes in virtual time or as ordinary bus participants."""
 
+import itertools
 import os
 import select
 import selectors
 import socket
 import struct
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
+
 from dbc.frame import Frame
-from dbc.node import NOTHING, Actions
 from hil.bus import link
 from hil.bus.link import LinkError
 from hil.bus.wire import NEVER, Clock, Port, Wire
+from hil.bus.wire_core import LOG_SENDER, MAX_PORTS
 
 QUEUE_FRAMES = 100_000
 """Frames a slow listener may lag behind before further ones are dropped, and counted."""
 
-_MAX_MAIL_BYTES = 32768
+_DISCARD_ROWS = 4096
 _IDLE_POLL_S = 0.2
 _LAST_FLUSH_S = 2.0
 _FRAMES_PER_SERVICE = 64
@@ -37,106 +39,99 @@ class NodeGoneError(Exception):
 
 
 class RemoteNode:
-    """A node whose code runs in another process, one exchange per entry point.
-
-    Frames it only latches wait here and travel with its next wake-up.
-    """
+    """A node whose code runs in another process, one exchange for each event."""
 
     def __init__(self, connection: socket.socket, hello: dict[str, Any], answer_timeout_s: float) -> None:
         self.name: str = hello["name"]
         self.accepts = None if hello["accepts"] is None else frozenset(hello["accepts"])
         self.latched = frozenset(hello["latched"])
-        self.transmits = frozenset(hello["transmits"])
-        self.exchanges = 0
+        self.link = connection.fileno()
         self._timeout_s = answer_timeout_s
         self._link = connection
-        self._mail = b""
         connection.setblocking(True)
         timeout = struct.pack("ll", int(answer_timeout_s), int(answer_timeout_s % 1 * 1e6))
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
 
-    def on_start(self, now_ns: int) -> Actions:
-        """Power-on or reset."""
-        return self._exchange(link.START, now_ns)
+    def ask(self, packet: memoryview | bytes, answer: bytearray) -> int:
+        """Put the process's answer to an event into `answer`; return its length in bytes.
 
-    def on_timer(self, now_ns: int) -> Actions:
-        """Timer interrupt."""
-        return self._exchange(link.TIMER, now_ns)
+        Raises
+        ------
+        NodeGoneError
+            If it has ended or does not answer in time.
+        """
+        with suppress(OSError):  # then there will be no answer
+            self._link.send(packet)
+        return self.late_answer(answer)
 
-    def on_frame(self, now_ns: int, frame: Frame) -> Actions:
-        """Receive interrupt."""
-        self._mail += link.pack_timed(now_ns, frame)
-        if frame.can_id in self.latched and len(self._mail) < _MAX_MAIL_BYTES:
-            return NOTHING
-        return self._exchange(link.FRAME, now_ns)
+    def late_answer(self, answer: bytearray) -> int:
+        """Wait for the answer to a packet that was sent, and return it like `ask`."""
+        try:
+            length = self._link.recv_into(answer)
+        except BlockingIOError:
+            raise NodeGoneError(self.name, f"did not answer for {self._timeout_s:g} s") from None
+        except OSError:
+            length = 0
+        if not length:
+            raise NodeGoneError(self.name, "ended")
+        return length
+
+    def save(self) -> None:
+        """Let the process write its record now."""
+        self.ask(link.pack_event(link.SAVE), bytearray(link.MAX_PACKET))
 
     def stop(self) -> None:
         """Tell the process to write its record and end."""
         with suppress(OSError):  # it may have ended by itself
-            self._link.send(link.pack_event(link.STOP, 0))
+            self._link.send(link.pack_event(link.STOP))
         self._link.close()
-
-    def _exchange(self, kind: int, now_ns: int) -> Actions:
-        try:
-            self._link.send(link.pack_event(kind, now_ns, self._mail))
-            answer = self._link.recv(link.MAX_PACKET)
-        except BlockingIOError:
-            raise NodeGoneError(self.name, f"did not answer for {self._timeout_s:g} s") from None
-        except OSError:
-            answer = b""
-        if not answer:
-            raise NodeGoneError(self.name, "ended")
-        self._mail = b""
-        self.exchanges += 1
-        return link.unpack_actions(answer)
 
 
 class Participant:
-    """A python-can program on the bus: hears everything, never makes the wire wait."""
+    """A python-can program on the bus: it reads the wire's log at its own pace.
 
-    accepts = None
-    latched: frozenset[int] = frozenset()
-    transmits: frozenset[int] = frozenset()
+    Attributes
+    ----------
+    name : str
+        Unique on the channel.
+    sender : int
+        Its number as a sender on the wire.
+    position : int
+        Row of the log that it gets next.
+    dropped : int
+        Frames it did not get because it was too slow.
+    """
 
-    def __init__(self, connection: socket.socket, name: str) -> None:
+    def __init__(self, connection: socket.socket, name: str, sender: int, position: int) -> None:
         self.name = name
+        self.sender = sender
+        self.position = position
         self.dropped = 0
         self._link = connection
-        self._queue: deque[bytes] = deque()
         connection.setblocking(False)
 
-    def on_start(self, now_ns: int) -> Actions:
-        """Have nothing to say at power-on."""
-        return NOTHING
-
-    def on_timer(self, now_ns: int) -> Actions:
-        """Have no timer."""
-        return NOTHING
-
-    def on_frame(self, now_ns: int, frame: Frame) -> Actions:
-        """Pass a frame on, or queue it while the program is slow."""
-        if len(self._queue) >= QUEUE_FRAMES:
-            self.dropped += 1
-        else:
-            self._queue.append(link.pack_timed(now_ns, frame))
-        self.flush()
-        return NOTHING
-
-    @property
-    def behind(self) -> int:
-        """Frames that wait for the program."""
-        return len(self._queue)
-
-    def flush(self) -> None:
-        """Send what the program has room for."""
+    def flush(self, log: np.ndarray) -> None:
+        """Send what the program has room for of what others sent; drop the oldest of too much."""
+        excess = len(log) - self.position - QUEUE_FRAMES
+        if excess > 0:
+            lost = log[self.position : self.position + excess, LOG_SENDER]
+            self.dropped += int(np.count_nonzero(lost != self.sender))
+            self.position += excess
+        rows = log[self.position :]
+        if not len(rows):
+            return
+        packets, send = rows.data.cast("B"), self._link.send
         try:
-            while self._queue:
-                self._link.send(self._queue[0])
-                self._queue.popleft()
+            for at, sender in zip(
+                range(0, len(packets), rows.strides[0]), rows[:, LOG_SENDER].tolist(), strict=True
+            ):
+                if sender != self.sender:
+                    send(packets[at : at + link.TIMED_FRAME_BYTES])
+                self.position += 1
         except BlockingIOError:
             pass
-        except OSError:
-            self._queue.clear()  # it has gone: service() will see the end of the link
+        except OSError:  # it has gone: service() will see the end of the link
+            self.position = len(log)
 
 
 class Hub:
@@ -171,9 +166,10 @@ class Hub:
         self._expected = expected
         self._virtual = expected is not None
         self._answer_timeout_s = answer_timeout_s
-        self._participants: dict[int, tuple[Port, Participant, socket.socket]] = {}
+        self._participants: dict[int, tuple[Participant, socket.socket]] = {}
         self._strangers: dict[int, socket.socket] = {}
-        self._names = 0
+        self._held: set[int] = set()
+        self._senders = itertools.count(MAX_PORTS)
         self._catch_up: Callable[[], None] = lambda: None
         self._selector = selectors.SelectSelector()
         self._path = link.socket_path(channel)
@@ -195,18 +191,14 @@ class Hub:
     @property
     def dropped(self) -> int:
         """Frames that slow listeners lost."""
-        return self._dropped_by_gone + sum(entry[1].dropped for entry in self._participants.values())
+        return self._dropped_by_gone + sum(who.dropped for who, _ in self._participants.values())
 
     def close(self) -> None:
         """End all nodes and participants and remove the socket; idempotent."""
         for node in self.nodes.values():
             node.stop()
-        deadline_s = time.monotonic() + _LAST_FLUSH_S
-        for _, participant, connection in self._participants.values():
-            while participant.behind and time.monotonic() < deadline_s:
-                select.select([], [connection], [], _LAST_FLUSH_S)
-                participant.flush()
-            self._dropped_by_gone += participant.dropped + participant.behind
+        self._flush_to_the_end()
+        for _, connection in self._participants.values():
             connection.close()
         for connection in self._strangers.values():
             connection.close()
@@ -218,8 +210,17 @@ class Hub:
             self._listener.close()
             self._path.unlink(missing_ok=True)
 
+    def lead_to(self, wire: Wire) -> None:
+        """Go on with another wire, whose bus time begins anew; who listens has heard all of the last one."""
+        self._flush_to_the_end()
+        for participant, _ in self._participants.values():
+            participant.position = 0
+        self.wire = wire
+        self.injections = []
+
     def service(self, timeout_s: float = 0.0) -> None:
-        """Greet who arrives, take what participants send, and pass on what they could not take before."""
+        """Greet who arrives, take what participants send, and pass on what they have not got yet."""
+        self._release_held()
         ready = self._selector.select(timeout_s)
         self._catch_up()
         for key, _ in ready:
@@ -229,8 +230,9 @@ class Hub:
                 self._greet(self._strangers.pop(key.fd))
             else:
                 self._take(key.fd)
-        for _, participant, _ in self._participants.values():
-            participant.flush()
+        log = self.wire.log
+        for participant, _ in self._participants.values():
+            participant.flush(log)
 
     def run_in_wall_time(
         self, keep_running: Callable[[], bool], clock_ns: Callable[[], int] = time.monotonic_ns
@@ -243,10 +245,40 @@ class Hub:
             next_ns = self.wire.next_event_ns()
             wait_s = _IDLE_POLL_S if next_ns >= NEVER else (next_ns - self.wire.now_ns) / 1e9
             self.service(min(max(wait_s, 0.0), _IDLE_POLL_S))
+            self._discard_what_all_have_read()
 
     def attach(self, name: str, clock: Clock | None = None) -> Port:
         """Put a node that has said hello onto the wire."""
         return self.wire.attach(self.nodes[name], clock)
+
+    def _flush_to_the_end(self) -> None:
+        """Give listeners some time to take the rest; what they do not take is dropped."""
+        log = self.wire.log
+        deadline_s = time.monotonic() + _LAST_FLUSH_S
+        for participant, connection in self._participants.values():
+            participant.flush(log)
+            while participant.position < len(log) and time.monotonic() < deadline_s:
+                select.select([], [connection], [], _LAST_FLUSH_S)
+                participant.flush(log)
+            self._dropped_by_gone += len(log) - participant.position
+
+    def _discard_what_all_have_read(self) -> None:
+        log = self.wire.log
+        if len(log) < _DISCARD_ROWS:
+            return
+        read = min((who.position for who, _ in self._participants.values()), default=len(log))
+        if read >= _DISCARD_ROWS:
+            self.wire.discard(read)
+            for participant, _ in self._participants.values():
+                participant.position -= read
+
+    def _release_held(self) -> None:
+        """Listen again to senders whose frames have found their way onto the bus."""
+        for fd in list(self._held):
+            participant, connection = self._participants[fd]
+            if self.wire.waiting(participant.sender) < _FRAMES_PER_SERVICE:
+                self._held.remove(fd)
+                self._selector.register(connection, selectors.EVENT_READ)
 
     def _bind(self) -> None:
         for _ in range(2):
@@ -291,11 +323,10 @@ class Hub:
         if self._virtual and hello["role"] == "node":
             self.nodes[hello["name"]] = RemoteNode(connection, hello, self._answer_timeout_s)
             return
-        self._names += 1
-        is_node = hello["role"] == "node"
-        participant = Participant(connection, hello["name"] if is_node else f"(participant {self._names})")
-        port = self.wire.attach(participant)
-        self._participants[connection.fileno()] = port, participant, connection
+        sender = next(self._senders)
+        name = hello["name"] if hello["role"] == "node" else f"(participant {sender})"
+        participant = Participant(connection, name, sender, len(self.wire.log))
+        self._participants[connection.fileno()] = participant, connection
         self._selector.register(connection, selectors.EVENT_READ)
 
     def _refusal(self, hello: dict[str, Any]) -> str | None:
@@ -304,7 +335,7 @@ class Hub:
         if not _is_complete(hello):
             return "the greeting is incomplete: use the same release on both sides"
         name = hello["name"] if hello["role"] == "node" else None
-        taken = set(self.nodes) | {entry[1].name for entry in self._participants.values()}
+        taken = set(self.nodes) | {who.name for who, _ in self._participants.values()}
         if self._expected is not None and name is not None and name not in self._expected:
             return f"this run has no place for a node named {name!r}"
         if name is not None and name.startswith("("):
@@ -314,17 +345,20 @@ class Hub:
         return None
 
     def _take(self, fd: int) -> None:
-        port, participant, connection = self._participants[fd]
+        participant, connection = self._participants[fd]
+        wire = self.wire
         try:
-            for _ in range(_FRAMES_PER_SERVICE - self.wire.waiting(port)):
+            for _ in range(_FRAMES_PER_SERVICE - wire.waiting(participant.sender)):
                 packet = connection.recv(link.MAX_PACKET)
                 if not packet:
                     break
                 frame = link.unpack_frame(packet)
                 if self._virtual:
-                    self.injections.append((self.wire.now_ns, frame))
-                self.wire.send(port, self.wire.now_ns, frame)
+                    self.injections.append((wire.now_ns, frame))
+                wire.send(participant.sender, wire.now_ns, frame)
             else:
+                self._held.add(fd)
+                self._selector.unregister(connection)
                 return
         except BlockingIOError:
             return
@@ -332,7 +366,7 @@ class Hub:
             pass  # it has gone, or sends what is no frame: cut it off
         self._selector.unregister(connection)
         self._dropped_by_gone += participant.dropped
-        self.wire.detach(port)
+        wire.withdraw(participant.sender)
         del self._participants[fd]
         connection.close()
 

@@ -1,23 +1,28 @@
 """The wire: a discrete-event simulation that owns time and decides who speaks when.
 
-Time is integer nanoseconds. The next event is the earliest of a frame's end, a node's wake-up, the release of
-a frame to its CAN controller, and arbitration; at the same instant they come in this order, and wake-ups in
-the order in which the nodes were attached.
+Time is integer nanoseconds. The next event is the earliest of a frame's end, a node's wake-up, an out-of-band
+frame, and arbitration; at the same instant they come in this order, and wake-ups in the order in which the
+nodes were attached. `hil.bus.wire_core` processes the events; here nodes come, go and are asked.
 """
 
-from array import array
-from dataclasses import dataclass, field
-from heapq import heappop, heappush
+from dataclasses import dataclass
+from enum import IntEnum
 
-from dbc.frame import EFF_FLAG, Frame
+import numpy as np
+
+from dbc.frame import Frame
 from dbc.jit import entry_point
-from dbc.node import NOTHING, Actions, Node
-from hil.bus.wire_time import classic_bits
+from dbc.node import NOTHING, Node
+from hil.bus import link
+from hil.bus import wire_core as at
+from hil.bus.wire_core import NEVER, arbitration_key
 
-NEVER = 1 << 62
-INTERMISSION_BITS = 3
-_frame_bits = entry_point(classic_bits)
-_NS_PER_S = 1_000_000_000
+__all__ = ["NEVER", "Clock", "FrameFault", "Port", "Wire", "arbitration_key"]
+
+_advance, _apply, _hand_over = (entry_point(f) for f in (at.advance, at.apply, at.hand_over))
+_local_ns, _bus_ns = entry_point(at.local_ns), entry_point(at.bus_ns)
+_QUEUE_ROWS = 4096
+_LOG_ROWS = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,50 +34,65 @@ class Clock:
 
     def local(self, bus_ns: int) -> int:
         """Return the node's time at bus time `bus_ns`, ns."""
-        elapsed_ns = bus_ns - self.phase_ns
-        return elapsed_ns + (elapsed_ns * self.drift_ppb // _NS_PER_S if self.drift_ppb else 0)
+        return int(_local_ns(self.phase_ns, self.drift_ppb, bus_ns))
 
     def bus(self, local_ns: int) -> int:
         """Return the first bus time at which the node's clock shows `local_ns` or later, ns."""
-        if not self.drift_ppb:
-            return self.phase_ns + local_ns
-        return self.phase_ns - (-local_ns * _NS_PER_S // (_NS_PER_S + self.drift_ppb))
+        return int(_bus_ns(self.phase_ns, self.drift_ppb, local_ns))
+
+
+class FrameFault(IntEnum):
+    """What can happen to a frame between its node and the wire; the argument in brackets.
+
+    Attributes
+    ----------
+    DROP
+        It is never sent.
+    CORRUPT
+        Payload bits are flipped [the payload's bits, byte 0 in the low eight].
+    DELAY
+        It is handed over later [ns].
+    REPEAT
+        It carries the payload of the last one before the fault.
+    """
+
+    DROP = at.DROP
+    CORRUPT = at.CORRUPT
+    DELAY = at.DELAY
+    REPEAT = at.REPEAT
+
+
+class LocalNode:
+    """A node in this process, asked as one in another process is."""
+
+    def __init__(self, node: Node) -> None:
+        self.name, self.accepts, self.latched = node.name, node.accepts, node.latched
+        self.link = at.NO_LINK
+        self._node = node
+
+    def ask(self, packet: memoryview, answer: bytearray) -> int:
+        """Put the node's answer to an event into `answer`; return its length in bytes, 0 for none."""
+        actions = link.deliver(self._node, packet)
+        return 0 if actions is NOTHING else link.pack_actions_into(answer, actions)
+
+    def late_answer(self, answer: bytearray) -> int:
+        """Never be needed: there is no link."""
+        raise AssertionError
 
 
 @dataclass(slots=True, eq=False)
 class Port:
     """A node's place on the wire."""
 
-    node: Node
+    node: "LocalNode | link.Askable"
     order: int
     clock: Clock
+    packet: memoryview
     connected: bool = True
-    on_bus_time: bool = False
-
-
-@dataclass(slots=True)
-class Traffic:
-    """Every frame that ended on the wire, in order: bus time of its end (ns), id, dlc, data."""
-
-    cells: array = field(default_factory=lambda: array("Q"))
-
-    def __len__(self) -> int:
-        return len(self.cells) // 4
-
-
-def arbitration_key(can_id: int) -> int:
-    """Return the number by which identifiers win arbitration: the lower first.
-
-    A standard frame beats an extended one with the same base identifier (ISO 11898-1).
-    """
-    if can_id & EFF_FLAG:
-        base, extension = (can_id >> 18) & 0x7FF, can_id & 0x3FFFF
-        return base << 19 | 1 << 18 | extension
-    return can_id << 19
 
 
 class Wire:
-    """A classic CAN bus between nodes, without errors.
+    """A classic CAN bus between nodes.
 
     Parameters
     ----------
@@ -84,159 +104,189 @@ class Wire:
 
     def __init__(self, bit_rate: int, out_of_band: frozenset[int] = frozenset()) -> None:
         self.bit_rate = bit_rate
-        self.now_ns = 0
-        self.traffic = Traffic()
-        self.busy_ns = 0
-        self._out_of_band = out_of_band
+        self._core = np.zeros(at.CORE_SIZE, np.int64)
+        self._core[at.END] = NEVER
+        self._core[at.BIT_RATE] = bit_rate
+        self._port_words = np.zeros((at.MAX_PORTS, at.PORT_SIZE), np.int64)
+        self._filters = np.zeros((0, at.FILTER_SIZE), np.int64)
+        self._queue = np.zeros((_QUEUE_ROWS, at.QUEUE_SIZE), np.int64)
+        self._log = np.zeros((_LOG_ROWS, at.LOG_SIZE), np.int64)
+        self._mail = np.zeros((at.MAX_PORTS, at.MAIL_SIZE), np.int64)
+        self._faults = np.zeros((at.MAX_FAULTS, at.FAULT_SIZE), np.int64)
+        self._out_of_band = np.array(sorted(out_of_band), np.int64)
+        self._answer = bytearray(link.MAX_PACKET)
+        self._answer_words = np.frombuffer(self._answer, np.int64)
         self._ports: list[Port] = []
-        self._wakes: list[int] = []
-        self._routes: dict[int, list[Port]] = {}
-        self._keys: dict[int, int] = {}
-        self._released: list[tuple[int, int, Port, Frame]] = []
-        self._pending: list[tuple[int, int, int, int, Port, Frame]] = []
-        self._sequence = 0
-        self._on_wire: tuple[Port, Frame] | None = None
-        self._end_ns = NEVER
-        self._idle_ns = 0
 
-    def attach(self, node: Node, clock: Clock | None = None) -> Port:
-        """Add a node; it hears nothing of what was already under way.
+    @property
+    def now_ns(self) -> int:
+        """Bus time, ns."""
+        return int(self._core[at.NOW])
+
+    @property
+    def log(self) -> np.ndarray:
+        """Frames that have ended, int64 of shape (frames, 4): end ns, head, data, sender; see `wire_core`."""
+        return self._log[: self._core[at.LOGGED]]
+
+    @property
+    def traffic(self) -> np.ndarray:
+        """Frames that have ended, uint64 of shape (frames, 4): bus time of the end (ns), id, dlc, data."""
+        log = self.log.view(np.uint64)
+        head = log[:, at.LOG_HEAD]
+        columns = (log[:, at.LOG_TIME], head & np.uint64(0xFFFF_FFFF), head >> np.uint64(32))
+        return np.column_stack([*columns, log[:, at.LOG_DATA]])
+
+    def attach(self, node: "Node | link.Askable", clock: Clock | None = None) -> Port:
+        """Add a node; it hears the frames that end from now on.
 
         Raises
         ------
         ValueError
-            If a node of that name is there already.
+            If a node of that name is there already, or there are too many.
         """
         if any(port.connected and port.node.name == node.name for port in self._ports):
             raise ValueError(f"there is a node named {node.name!r} on this bus already")
+        order = len(self._ports)
+        if order == at.MAX_PORTS:
+            raise ValueError(f"a wire has room for {at.MAX_PORTS} nodes")
         clock = clock or Clock()
-        port = Port(node, len(self._ports), clock, on_bus_time=clock == Clock())
+        asked = node if isinstance(node, link.Askable) else LocalNode(node)
+        port = Port(asked, order, clock, memoryview(self._mail[order]).cast("B"))
+        self._port_words[order] = NEVER, clock.phase_ns, clock.drift_ppb, 0, asked.link, 0
+        self._core[at.PORTS] += 1
         self._ports.append(port)
-        self._wakes.append(NEVER)
-        self._routes.clear()
+        self._set_filters()
         return port
 
     def detach(self, port: Port) -> None:
         """Cut a node off: it neither hears nor sends, and what it had queued is gone."""
         port.connected = False
-        self._wakes[port.order] = NEVER
-        self._routes.clear()
-        self._released[:] = sorted(entry for entry in self._released if entry[2] is not port)
-        self._pending[:] = sorted(entry for entry in self._pending if entry[4] is not port)
+        self._port_words[port.order, [at.WAKE, at.MAILED]] = NEVER, 0
+        self._core[at.DUE] &= ~(1 << port.order)
+        self.withdraw(port.order)
+        self._set_filters()
+
+    def reconnect(self, port: Port) -> None:
+        """Put a node that was cut off back to its place; `start` powers it on."""
+        port.connected = True
+        self._set_filters()
 
     def start(self, port: Port) -> None:
         """Power a node on now."""
-        self._apply(port, port.node.on_start(port.clock.local(self.now_ns)))
+        words = self._mail[port.order]
+        words[: at.FRAMES] = link.START, port.clock.local(self.now_ns)
+        self._port_words[port.order, at.MAILED] = 0
+        self._apply(port, port.node.ask(port.packet[: at.FRAMES * 8], self._answer))
 
-    def send(self, port: Port, ready_ns: int, frame: Frame) -> None:
-        """Hand a frame to the port's CAN controller at bus time `ready_ns`, now or later."""
-        self._sequence += 1
-        now_ns = self.now_ns
-        if ready_ns > now_ns or frame.can_id in self._out_of_band:
-            heappush(self._released, (max(ready_ns, now_ns), self._sequence, port, frame))
-        else:
-            self._queue(now_ns, self._sequence, port, frame)
+    def send(self, sender: int, ready_ns: int, frame: Frame) -> None:
+        """Hand a frame to a CAN controller at bus time `ready_ns`, now or later.
 
-    def waiting(self, port: Port) -> int:
-        """Return the number of frames that a port has handed over and that have not started."""
-        return sum(entry[4] is port for entry in self._pending) + sum(
-            entry[2] is port for entry in self._released
+        Parameters
+        ----------
+        sender : int
+            A port's order; a number from `wire_core.MAX_PORTS` on for a sender that is no node.
+        """
+        if self._core[at.QUEUED] == len(self._queue):
+            self._make_room()
+        can_id, dlc, data = frame
+        head = can_id | dlc << 32
+        _hand_over(
+            self._core, self._queue, self._faults, self._out_of_band, sender, ready_ns, head, _signed(data)
         )
+
+    def withdraw(self, sender: int) -> None:
+        """Forget what a sender has handed over and that has not begun."""
+        queued = self._queue[: self._core[at.QUEUED]]
+        kept = queued[queued[:, at.SENDER] != sender]
+        self._queue[: len(kept)] = kept
+        self._core[at.QUEUED] = len(kept)
+
+    def waiting(self, sender: int) -> int:
+        """Return the number of frames that a sender has handed over and that have not begun."""
+        return int(np.count_nonzero(self._queue[: self._core[at.QUEUED], at.SENDER] == sender))
+
+    def spoil(self, can_id: int, fault: FrameFault, argument: int, count: int) -> None:
+        """Let something happen to the next `count` frames of an id that are handed over.
+
+        Raises
+        ------
+        ValueError
+            If too many faults are under way.
+        """
+        free = np.flatnonzero(self._faults[:, at.FAULT_COUNT] == 0)
+        if not free.size:
+            raise ValueError(f"there is room for {at.MAX_FAULTS} faults at a time")
+        if fault == FrameFault.REPEAT:
+            earlier = self.log[self.log[:, at.LOG_HEAD] & 0xFFFF_FFFF == can_id]
+            argument = int(earlier[-1, at.LOG_DATA]) if len(earlier) else 0
+        self._faults[free[0]] = can_id, fault, _signed(argument), count
+
+    def exchanges(self, port: Port) -> int:
+        """Return how many events a node in another process was asked about."""
+        return int(self._port_words[port.order, at.EXCHANGES])
 
     def next_event_ns(self) -> int:
         """Return the bus time of the next event, `NEVER` if there is none."""
-        arbitration_ns = max(self._idle_ns, self.now_ns) if self._pending and self._on_wire is None else NEVER
-        release_ns = self._released[0][0] if self._released else NEVER
-        return min(self._end_ns, min(self._wakes, default=NEVER), release_ns, arbitration_ns)
+        return int(at.next_event_ns(self._core, self._port_words, self._queue))
 
     def run(self, until_ns: int) -> None:
         """Process every event before bus time `until_ns`."""
-        wakes, released, pending = self._wakes or [NEVER], self._released, self._pending
+        core, ports, places = self._core, self._port_words, self._ports
+        filters, mail, faults, out_of_band = self._filters, self._mail, self._faults, self._out_of_band
+        answer = self._answer_words
         while True:
-            end_ns, wake_ns = self._end_ns, min(wakes)
-            event_ns = end_ns if end_ns <= wake_ns else wake_ns
-            release_ns = released[0][0] if released else NEVER
-            if release_ns < event_ns:
-                event_ns = release_ns
-            arbitration_ns = NEVER
-            if pending and end_ns == NEVER:
-                arbitration_ns = self._idle_ns if self._idle_ns > self.now_ns else self.now_ns
-                if arbitration_ns < event_ns:
-                    event_ns = arbitration_ns
-            if event_ns >= until_ns:
-                break
-            self.now_ns = event_ns
-            if event_ns == end_ns:
-                self._finish_frame()
-            elif event_ns == wake_ns:
-                self._wake()
-            elif event_ns == release_ns:
-                self._release()
+            due = _advance(
+                core, ports, filters, self._queue, self._log, mail, faults, out_of_band, answer, until_ns
+            )
+            if due >= 0:
+                port = places[due & 0xFF]
+                self._apply(port, port.node.ask(port.packet[: due >> 8], self._answer))
+            elif due == at.NOBODY:
+                return
+            elif due == at.NO_ROOM:
+                self._make_room()
             else:
-                self._arbitrate()
-        self.now_ns = max(self.now_ns, until_ns)
+                port = places[at.NO_ANSWER - due]
+                self._apply(port, port.node.late_answer(self._answer))
 
-    def _wake(self) -> None:
-        now_ns = self.now_ns
-        order = self._wakes.index(now_ns)
-        port = self._ports[order]
-        self._wakes[order] = NEVER
-        local_ns = now_ns if port.on_bus_time else port.clock.local(now_ns)
-        self._apply(port, port.node.on_timer(local_ns))
+    def discard(self, rows: int) -> None:
+        """Forget the oldest rows of the log."""
+        kept = self.log[rows:].copy()
+        self._log[: len(kept)] = kept
+        self._core[at.LOGGED] = len(kept)
 
-    def _apply(self, port: Port, actions: Actions) -> None:
-        wake_ns, sends = actions
-        on_bus_time, to_bus = port.on_bus_time, port.clock.bus
-        if wake_ns is not None:
-            wake_ns = wake_ns if on_bus_time else to_bus(wake_ns)
-            self._wakes[port.order] = wake_ns if wake_ns > self.now_ns else self.now_ns
-        for send_ns, frame in sends:
-            self.send(port, send_ns if on_bus_time else to_bus(send_ns), frame)
+    def _apply(self, port: Port, length: int) -> None:
+        if length:
+            _apply(
+                self._core,
+                self._port_words,
+                self._queue,
+                self._faults,
+                self._out_of_band,
+                self._answer_words,
+                length,
+                port.order,
+            )
 
-    def _release(self) -> None:
-        ready_ns, sequence, port, frame = heappop(self._released)
-        if frame.can_id in self._out_of_band:
-            self._deliver(port, frame)
-        else:
-            self._queue(ready_ns, sequence, port, frame)
+    def _make_room(self) -> None:
+        """Double what may be full."""
+        if self._core[at.LOGGED] == len(self._log):
+            self._log = np.concatenate([self._log, np.zeros_like(self._log)])
+        if self._core[at.QUEUED] + at.MAX_ANSWER_FRAMES > len(self._queue):
+            self._queue = np.concatenate([self._queue, np.zeros_like(self._queue)])
 
-    def _queue(self, ready_ns: int, sequence: int, port: Port, frame: Frame) -> None:
-        can_id = frame.can_id
-        key = self._keys.get(can_id)
-        if key is None:
-            key = self._keys[can_id] = arbitration_key(can_id)
-        heappush(self._pending, (key, port.order, ready_ns, sequence, port, frame))
+    def _set_filters(self) -> None:
+        rows = []
+        for port in self._ports:
+            node = port.node
+            if port.connected:
+                known = node.latched if node.accepts is None else node.accepts
+                rows += [(can_id, port.order, can_id in node.latched) for can_id in sorted(known)]
+                rows += [(at.EVERY_ID, port.order, False)] if node.accepts is None else []
+        self._filters = np.array(rows, np.int64).reshape(-1, at.FILTER_SIZE)
+        self._core[at.FILTERS] = len(rows)
 
-    def _arbitrate(self) -> None:
-        *_, port, frame = heappop(self._pending)
-        bits = _frame_bits(*frame)
-        start_ns = self.now_ns
-        self._on_wire = port, frame
-        self._end_ns = start_ns + (bits - INTERMISSION_BITS) * _NS_PER_S // self.bit_rate
-        self._idle_ns = start_ns + bits * _NS_PER_S // self.bit_rate
-        self.busy_ns += self._idle_ns - start_ns
 
-    def _finish_frame(self) -> None:
-        assert self._on_wire is not None
-        port, frame = self._on_wire
-        self._on_wire = None
-        self._end_ns = NEVER
-        self._deliver(port, frame)
-
-    def _deliver(self, sender: Port, frame: Frame) -> None:
-        now_ns = self.now_ns
-        self.traffic.cells.extend((now_ns, *frame))
-        for port in self._routes.get(frame.can_id) or self._route(frame.can_id):
-            if port is not sender:
-                local_ns = now_ns if port.on_bus_time else port.clock.local(now_ns)
-                actions = port.node.on_frame(local_ns, frame)
-                if actions is not NOTHING:
-                    self._apply(port, actions)
-
-    def _route(self, can_id: int) -> list[Port]:
-        route = self._routes[can_id] = [
-            port
-            for port in self._ports
-            if port.connected and (port.node.accepts is None or can_id in port.node.accepts)
-        ]
-        return route
+def _signed(word: int) -> int:
+    """Return the two's complement value of a 64-bit word."""
+    return word - (1 << 64) if word >> 63 == 1 else word

@@ -66,4 +66,4 @@ def play(wire: Wire, supervisor: Supervisor, options: RunOptions, service: Calla
 
 def traffic_of(wire: Wire) -> np.ndarray:
     """Return the wire's traffic as rows of end time (ns), id, dlc, data."""
-    return np.array(wire.traffic.cells, dtype=np.uint64).reshape(-1, 4)
+    return wire.traffic

@@ -62,7 +62,7 @@ def run_lockstep(options: RunOptions) -> Recording:
                 _run_without(error, wire, ports)
             wall_s = time.perf_counter() - ready_s
         simulated_s = wire.now_ns / 1e9
-        exchanges = sum(node.exchanges for node in hub.nodes.values())
+        exchanges = sum(wire.exchanges(port) for port in ports.values())
         hub.close()
         processes.wait()
         notes: dict[str, object] = {
@@ -116,7 +116,7 @@ def _run_without(gone: NodeGoneError, wire: Wire, ports: dict[str, Port]) -> Non
 
 
 def _motor_stop(plant: dict[str, np.ndarray] | None, gone_ns: int) -> str:
-    if plant is None:
+    if plant is None or not len(plant["time_ns"]):
         return ""
     resting = np.abs(plant["motor_speed_rad_s"]) < _MOTOR_AT_REST_RAD_S
     moving = plant["time_ns"][~resting]

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import can
 
 from dbc.contract import ContractError
-from dbc.node import Actions, Node
+from dbc.node import Node
 from dbc.record import Record
 from hil.bus import link
 from hil.bus.hilbus import HilBus
@@ -83,7 +83,7 @@ def node_main(
             connection, answer = _attach(arguments.channel, node)
             if answer["virtual"]:
                 with _recorded(node, arguments.record):
-                    serve(node, connection, arguments.channel)
+                    serve(node, connection, arguments.channel, arguments.record)
             else:
                 bus: can.BusABC = HilBus(arguments.channel, greeted=(connection, answer))
                 _run_in_wall_time(node, bus, arguments, clock)
@@ -117,35 +117,32 @@ def _open_bus(arguments: argparse.Namespace) -> can.BusABC:
         raise can.CanInitializationError(f"cannot open {where} ({error}): check -i and -c") from error
 
 
-def serve(node: Node, connection: socket.socket, channel: str) -> None:
-    """Answer the hub's events in virtual time until it says stop.
+def serve(node: RecordingNode, connection: socket.socket, channel: str, record: Path | None) -> None:
+    """Answer the hub's events in virtual time until it says stop; save the record when it says so.
 
     Raises
     ------
     LinkError
         If the hub goes away without saying so.
     """
+    packet, answer = memoryview(bytearray(link.MAX_PACKET)), bytearray(link.MAX_PACKET)
+    view, receive, send = memoryview(answer), connection.recv_into, connection.send
     with connection:
         while True:
             try:
-                packet = connection.recv(link.MAX_PACKET)
+                length = receive(packet)
             except OSError:
-                packet = b""
-            if not packet:
+                length = 0
+            if not length:
                 raise LinkError(
                     f"the hub of channel {channel!r} ended without a stop: is the bench still there?"
                 )
-            kind, now_ns, frames = link.unpack_event(packet)
+            kind = packet[0]  # the least significant byte
             if kind == link.STOP:
                 return
-            actions = Actions()
-            for time_ns, frame in frames:
-                actions = node.on_frame(time_ns, frame)
-            if kind == link.TIMER:
-                actions = node.on_timer(now_ns)
-            elif kind == link.START:
-                actions = node.on_start(now_ns)
-            connection.send(link.pack_actions(actions))
+            if kind == link.SAVE and record is not None:
+                node.record.save(record / f"{node.name}.npz")
+            send(view[: link.pack_actions_into(answer, link.deliver(node, packet[:length]))])
 
 
 def _attach(channel: str, node: Node) -> tuple[socket.socket, dict[str, Any]]:

@@ -69,7 +69,7 @@ def test_without_its_controller_the_motor_stops_in_time(lost_ms):
     wire.run(lost_ns + 200 * PERIOD_NS)
 
     record = plant.record.columns_by_name()
-    traffic = np.array(wire.traffic.cells, np.uint64).reshape(-1, 4)
+    traffic = wire.traffic
     last_command_ns = int(traffic[traffic[:, 1] == CONTRACT.drive_command.can_id][-1, 0])
     assert last_command_ns <= lost_ns + LONGEST_COMMAND_NS
     latched_ns = next_period(last_command_ns)
