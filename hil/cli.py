@@ -200,12 +200,12 @@ def _table(result: dict[str, Any]) -> Table:
     for key, label in (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")):
         limit, paper = ((source or {}).get(key) for source in (result["limits"], result["paper"]))
         table.add_row(label, *(_number(value, ".4f") for value in (result[key], limit, paper)))
-    latency = result["latency_us"] or {}
+    latency = result["timing"]["latency_us"]
     rows = (
         ("speed chatter / rpm per period", _number(result["chatter_rpm_per_period"], ".2f")),
         ("bus load / %", _number(result["bus_load_percent"], ".1f")),
-        ("feedback to command, median / µs", _number(latency.get("p50"), ".0f")),
-        ("feedback to command, maximum / µs", _number(latency.get("max"), ".0f")),
+        ("feedback to command, median / µs", _number(latency["p50"], ".0f")),
+        ("feedback to command, maximum / µs", _number(latency["max"], ".0f")),
         ("start-up / s", _number(result["startup_s"], ".1f")),
         ("times real time", _number(result["realtime_factor"], ".1f")),
     )

@@ -8,12 +8,13 @@ import numpy as np
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
-from firmware_py.node import EXECUTION_NS, PHASE_NS
+from firmware_py.node import PHASE_NS
 from firmware_py.state_machine import State
 from firmware_py.task import Fault
 from hil.bus.wire_time import classic_bits
 from hil.run.options import Recording, RunOptions
-from hil.scenario import PERIOD_S, Scenario
+from hil.scenario import PERIOD_S, Scenario, TimingLimits
+from hil.timing import Timing, timing_of
 
 M_TO_MM = 1e3
 PA_TO_BAR = 1e-5
@@ -92,14 +93,12 @@ def result_of(
     rms_mm = _finite(np.sqrt(np.nanmean(error_mm**2))) if np.isfinite(error_mm).any() else None
     max_mm = _finite(np.nanmax(np.abs(error_mm))) if np.isfinite(error_mm).any() else None
     limits = scenario.limits.get(options.controller)
+    timing = timing_in(recording, trace, contract, options.bit_rate, mode)
     complete = not recording.ending
-    within = None
-    verdict = left_run(trace) if complete else ""
-    if verdict:
-        within = False
-    elif limits and complete and rms_mm is not None and max_mm is not None:
-        within = rms_mm <= limits["rms_mm"] and max_mm <= limits["max_mm"]
-        verdict = "" if within else "the scenario's limits were missed"
+    within, verdict = None, ""
+    if complete:
+        tracking = _tracking_within(limits, rms_mm, max_mm)
+        within, verdict = _judged(trace, limits, tracking, timing, scenario.timing)
     return {
         "scenario": scenario.name,
         "controller": options.controller,
@@ -117,7 +116,8 @@ def result_of(
         "paper": scenario.paper.get(options.controller),
         "bit_rate": options.bit_rate,
         "bus_load_percent": bus_load_percent(recording, contract, options.bit_rate),
-        "latency_us": latency_us(recording, contract),
+        "timing": timing.summary(),
+        "timing_limits": scenario.timing.given() or None,
         "bus_frames": len(recording.traffic),
         "bus_sha256": hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest(),
         "scenario_start_bus_s": recording.start_ns / 1e9,
@@ -127,6 +127,35 @@ def result_of(
         "realtime_factor": recording.simulated_s / recording.wall_s,
         "notes": recording.notes,
     }
+
+
+def _tracking_within(
+    limits: dict[str, float] | None, rms_mm: float | None, max_mm: float | None
+) -> bool | None:
+    if not limits or rms_mm is None or max_mm is None:
+        return None
+    return rms_mm <= limits["rms_mm"] and max_mm <= limits["max_mm"]
+
+
+def _judged(
+    trace: Trace,
+    limits: dict[str, float] | None,
+    tracking: bool | None,
+    timing: Timing,
+    timing_limits: TimingLimits,
+) -> tuple[bool | None, str]:
+    """Return whether all limits were met, None if they cannot be judged or there are none, and what broke."""
+    complaints = []
+    if left := left_run(trace):
+        complaints.append(left)
+    elif tracking is False:
+        complaints.append("the scenario's limits were missed")
+    if broken := timing.violations(timing_limits):
+        times = "once" if len(broken) == 1 else f"{len(broken)} times"
+        complaints.append(f"timing limits were broken {times}, first in {broken[0]}")
+    if complaints:
+        return False, "; ".join(complaints)
+    return (tracking if limits else bool(timing_limits.given()) or None), ""
 
 
 def left_run(trace: Trace) -> str:
@@ -153,27 +182,21 @@ def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) ->
     return 100.0 * bits / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
 
 
-def latency_us(recording: Recording, contract: Contract) -> dict[str, float] | None:
-    """Return percentiles of the bus time from a feedback's end to the end of the command made from it, µs.
+def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: int, mode: str) -> Timing:
+    """Return the timing of the scenario's periods, those of the bring-up left out.
 
-    A command belongs to the last controller period that began an execution time or more before the command
-    ended on the bus, and was made from the newest PositionFeedback that had ended at that period's begin.
+    Of a real-time run the last period is left out, too: it is stopped at that period's start.
     """
-    traffic, controller = recording.traffic, recording.controller
-    if controller is None:
-        return None
-    ends_ns = traffic[:, 0].astype(np.int64)
-    feedback_ns = ends_ns[traffic[:, 1] == contract.position_feedback.can_id]
-    command_ns = ends_ns[traffic[:, 1] == contract.drive_command.can_id]
-    timer_ns = controller["time_ns"] + PHASE_NS
-    period = np.searchsorted(timer_ns, command_ns - EXECUTION_NS, side="right") - 1
-    newest = np.searchsorted(feedback_ns, timer_ns[period], side="right") - 1
-    known = (period >= 0) & (newest >= 0)
-    if not known.any():
-        return None
-    latency = (command_ns[known] - feedback_ns[newest[known]]) / 1e3
-    p50, p99 = np.percentile(latency, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(latency.max())}
+    periods = len(trace["time_s"]) - (mode == "realtime")
+    controller = recording.controller
+    return timing_of(
+        recording.traffic,
+        contract,
+        bit_rate,
+        recording.start_ns,
+        recording.start_ns + periods * PERIOD_NS,
+        None if controller is None else controller["time_ns"] + PHASE_NS,
+    )
 
 
 def _first_period(recording: Recording) -> int:

@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,26 @@ MAX_LOAD_N = 1e6
 
 class ScenarioError(ValueError):
     """A scenario does not exist or does not make sense; the message says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimingLimits:
+    """Largest values that each control period's timing may have; None is not checked.
+
+    The figures are those of `hil.timing.Timing`: ages, latency and jitter in µs, missed and late periods as
+    counts over the scenario.
+    """
+
+    feedback_age_us: float | None = None
+    setpoint_age_us: float | None = None
+    latency_us: float | None = None
+    jitter_us: float | None = None
+    missed_periods: int | None = None
+    late_periods: int | None = None
+
+    def given(self) -> dict[str, float]:
+        """Return the limits that are checked."""
+        return {name: limit for name, limit in asdict(self).items() if limit is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +61,8 @@ class Scenario:
         For each controller that has to meet one, `rms_mm` and `max_mm`.
     paper : dict
         The paper's figures for each controller, `rms_mm` and `max_mm`; empty if it has none.
+    timing : TimingLimits
+        Limits on the timing, whichever controller is played.
     """
 
     name: str
@@ -50,6 +72,7 @@ class Scenario:
     load: tuple[tuple[float, float], ...]
     limits: dict[str, dict[str, float]]
     paper: dict[str, dict[str, float]]
+    timing: TimingLimits = field(default_factory=TimingLimits)
 
     @property
     def periods(self) -> int:
@@ -98,13 +121,13 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{name}: {error}") from error
     if duration_s is not None:
-        content |= {"duration_s": duration_s, "limits": {}, "paper": {}}
+        content |= {"duration_s": duration_s, "limits": {}, "paper": {}, "timing": {}}
     return _checked(path.stem, content)
 
 
 def _checked(name: str, content: dict[str, Any]) -> Scenario:
     required = {"title", "reference", "duration_s"}
-    optional = {"load", "limits", "paper"}
+    optional = {"load", "limits", "paper", "timing"}
     if missing := sorted(required - set(content)):
         raise ScenarioError(f"{name}: missing key {missing[0]!r}")
     if unknown := sorted(set(content) - required - optional):
@@ -141,7 +164,23 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
         load=tuple((float(time_s), float(force_n)) for time_s, force_n in load),
         limits=content.get("limits", {}),
         paper=content.get("paper", {}),
+        timing=_timing_limits(name, content.get("timing", {})),
     )
+
+
+def _timing_limits(name: str, table: Any) -> TimingLimits:
+    allowed = {limit.name for limit in fields(TimingLimits)}
+    hint = f"allowed are {', '.join(sorted(allowed))}"
+    if not isinstance(table, dict):
+        raise ScenarioError(f"{name}: timing must be a table of limits; {hint}")
+    if unknown := sorted(set(table) - allowed):
+        raise ScenarioError(f"{name}: unknown key {unknown[0]!r} in timing; {hint}")
+    for key, limit in table.items():
+        counted = not key.endswith("_us")
+        if not _is_number(limit) or limit < 0 or (counted and not isinstance(limit, int)):
+            kind = "whole number" if counted else "number of µs"
+            raise ScenarioError(f"{name}: timing.{key} is {limit!r}, must be a {kind} from 0 on; {hint}")
+    return TimingLimits(**table)
 
 
 def _is_number(value: Any) -> bool:

@@ -68,8 +68,12 @@ def test_the_result_has_the_keys_that_others_rely_on(result):
     for key in ("rms_mm", "max_mm", "bus_load_percent", "wall_s", "startup_s", "realtime_factor"):
         assert math.isfinite(result[key])
         assert result[key] > 0
-    assert set(result["latency_us"]) == {"p50", "p99", "max"}
-    assert result["latency_us"]["p50"] <= result["latency_us"]["p99"] <= result["latency_us"]["max"]
+    for key in ("feedback_age_us", "setpoint_age_us", "latency_us", "jitter_us"):
+        figure = result["timing"][key]
+        assert set(figure) == {"p50", "p99", "max"}
+        assert figure["p50"] <= figure["p99"] <= figure["max"]
+    assert (result["timing"]["missed_periods"], result["timing"]["late_periods"]) == (0, 0)
+    assert result["timing"]["timer"] == "recorded"
     assert len(bytes.fromhex(result["bus_sha256"])) == 32
     assert result["realtime_factor"] == pytest.approx(result["simulated_s"] / result["wall_s"])
 

@@ -119,10 +119,12 @@ def test_the_chart_of_one_period():
 
 def test_latency_from_feedback_to_command_as_reported_and_as_counted_from_the_log():
     run = played("sine")
-    feedback = ends_of("sine", CONTRACT.position_feedback)
-    command = ends_of("sine", CONTRACT.drive_command)
+    feedback, command = (
+        ends[ends >= run.recording.start_ns]
+        for ends in (ends_of("sine", m) for m in (CONTRACT.position_feedback, CONTRACT.drive_command))
+    )
     latency_us = (command - feedback) / 1e3
-    reported = run.result["latency_us"]
+    reported = run.result["timing"]["latency_us"]
     assert reported["p50"] == pytest.approx(np.percentile(latency_us, 50))
     assert reported["p99"] == pytest.approx(np.percentile(latency_us, 99))
     assert reported["max"] == latency_us.max()
