@@ -18,6 +18,7 @@ from rich.table import Table
 from dbc.contract import Contract, ContractError
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
+from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import Wire
 from hil.measure import result_of, trace_of
 from hil.report import OutputDirectory
@@ -38,6 +39,7 @@ from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenari
 from hil.supervisor import BRING_UP_S
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
+EXIT_UNUSABLE = 1
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 MODES = {"lockstep": run_lockstep, "inprocess": run_inprocess, "realtime": run_realtime}
@@ -104,6 +106,11 @@ def _parser() -> argparse.ArgumentParser:
         "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
     )
     bus.add_argument("--parent", type=int, help=argparse.SUPPRESS)
+
+    vcan = commands.add_parser("vcan", help="SocketCAN on this machine")
+    questions = vcan.add_subparsers(required=True, metavar="QUESTION")
+    status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
+    status.set_defaults(command=_vcan_status)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)
@@ -233,6 +240,12 @@ def _bus(arguments: argparse.Namespace) -> int:
         if hub.dropped:
             print(f"hil: {hub.dropped} frames were dropped for slow listeners", file=sys.stderr)
     return EXIT_OK
+
+
+def _vcan_status(_: argparse.Namespace) -> int:
+    status = socketcan_status()
+    print(status.line)
+    return EXIT_OK if status.usable else EXIT_UNUSABLE
 
 
 def _list(_: argparse.Namespace) -> int:
