@@ -18,6 +18,7 @@ from rich.table import Table
 from dbc.contract import Contract, ContractError
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
+from hil.bus.opening import bus_settings
 from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import Wire
 from hil.measure import result_of, trace_of
@@ -84,10 +85,10 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .trc ...")
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
     run.add_argument(
-        "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
+        "-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; with -i the adapter's)"
     )
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
-    run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface")
+    run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface (default: own)")
     run.add_argument("-c", "--channel", metavar="C", help="its channel; lockstep: for listeners")
     run.add_argument(
         "--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower"
@@ -138,9 +139,14 @@ def _check_bit_rate(bit_rate: int) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
-    _check_bit_rate(arguments.bitrate)
+    if arguments.bitrate is not None:
+        _check_bit_rate(arguments.bitrate)
+    bus = arguments.interface, arguments.channel, arguments.bitrate
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
+    if arguments.interface is not None:
+        bus = bus_settings(*bus)
+    interface, channel, bit_rate = bus
     stopped = StopFlag.on_signals()
     console = Console(stderr=True)
     out = arguments.out or Path("out") / scenario.name
@@ -150,10 +156,10 @@ def _run(arguments: argparse.Namespace) -> int:
                 scenario=scenario,
                 controller=arguments.controller,
                 record_directory=folder.scratch,
-                bit_rate=arguments.bitrate,
+                bit_rate=bit_rate,
                 dbc=arguments.dbc,
-                interface=arguments.interface,
-                channel=arguments.channel,
+                interface=interface,
+                channel=channel,
                 rt_ratio=arguments.rt_ratio,
                 start_timeout_s=arguments.start_timeout,
                 answer_timeout_s=arguments.answer_timeout,

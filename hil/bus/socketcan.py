@@ -1,13 +1,18 @@
-"""SocketCAN: whether this machine has it."""
+"""SocketCAN: whether this machine has it, and a bus that outlives its interface being down."""
 
 import errno
+import os
 import platform
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+import can
+from can.interfaces.socketcan import SocketcanBus
 
 _DEVICES = Path("/sys/class/net")
 _MODULES = Path("/lib/modules", platform.release())
@@ -97,3 +102,60 @@ def _can_interfaces(devices: Path) -> Iterator[tuple[str, bool]]:
         with suppress(OSError, ValueError):  # gone by now, or no device at all (bonding_masters)
             if int((device / "type").read_text()) == _ARPHRD_CAN:
                 yield device.name, bool(int((device / "flags").read_text(), 16) & _IFF_UP)
+
+
+_INTERRUPTED = (errno.ENETDOWN, errno.ENOBUFS)
+_GONE = (errno.ENODEV, errno.ENXIO)
+_REPORT_INTERVAL_S = 1.0
+
+
+class OutlivesInterruptions(can.BusABC):
+    """Mixin for a SocketCAN bus: an interface that is down for a while loses frames, not the process.
+
+    While the interface is down (ENETDOWN), or its queue is full because nobody acknowledges (ENOBUFS), a
+    frame sent is lost and counted, as on a cable that is unplugged, and nothing is received; standard error
+    says so, and again when frames get through. The socket itself stays bound. An interface that was removed
+    (ENODEV, ENXIO: an adapter unplugged) never comes back to its sockets: that stays an error.
+    """
+
+    channel_info = "CAN bus"
+    _lost = 0
+    _reported_s = 0.0
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame, or lose it while the interface is down."""
+        try:
+            super().send(msg, timeout)  # type: ignore[safe-super]  # of the bus this is mixed into
+        except can.CanOperationError as error:
+            if error.error_code not in _INTERRUPTED:
+                raise self._explained(error) from error
+            if not self._lost:
+                self._report(f"{os.strerror(error.error_code)}; frames are lost until it is back")
+            self._lost += 1
+        else:
+            if self._lost and time.monotonic() - self._reported_s >= _REPORT_INTERVAL_S:
+                self._report(f"back, {self._lost} frames could not be sent")
+                self._lost = 0
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            return super()._recv_internal(timeout)
+        except can.CanOperationError as error:
+            if error.error_code not in _INTERRUPTED:
+                raise self._explained(error) from error
+            return None, False
+
+    def _report(self, text: str) -> None:
+        self._reported_s = time.monotonic()
+        print(f"{self.channel_info}: {text}", file=sys.stderr, flush=True)
+
+    def _explained(self, error: can.CanOperationError) -> can.CanOperationError:
+        if error.error_code not in _GONE:
+            return error
+        return can.CanOperationError(
+            f"{self.channel_info} is gone: plug the adapter in again, or see `hil vcan status`"
+        )
+
+
+class SteadySocketcanBus(OutlivesInterruptions, SocketcanBus):
+    """python-can's `socketcan`, which a network that is down for a while does not end."""
