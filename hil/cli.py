@@ -18,6 +18,8 @@ from rich.table import Table
 from dbc.contract import Contract, ContractError
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
+from hil.bus.opening import bus_settings
+from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import Wire
 from hil.measure import result_of, trace_of
 from hil.report import OutputDirectory
@@ -38,6 +40,7 @@ from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenari
 from hil.supervisor import BRING_UP_S
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
+EXIT_UNUSABLE = 1
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 MODES = {"lockstep": run_lockstep, "inprocess": run_inprocess, "realtime": run_realtime}
@@ -82,10 +85,10 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .trc ...")
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
     run.add_argument(
-        "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
+        "-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; with -i the adapter's)"
     )
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
-    run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface")
+    run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface (default: own)")
     run.add_argument("-c", "--channel", metavar="C", help="its channel; lockstep: for listeners")
     run.add_argument(
         "--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower"
@@ -104,6 +107,11 @@ def _parser() -> argparse.ArgumentParser:
         "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
     )
     bus.add_argument("--parent", type=int, help=argparse.SUPPRESS)
+
+    vcan = commands.add_parser("vcan", help="SocketCAN on this machine")
+    questions = vcan.add_subparsers(required=True, metavar="QUESTION")
+    status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
+    status.set_defaults(command=_vcan_status)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)
@@ -131,9 +139,14 @@ def _check_bit_rate(bit_rate: int) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
-    _check_bit_rate(arguments.bitrate)
+    if arguments.bitrate is not None:
+        _check_bit_rate(arguments.bitrate)
+    bus = arguments.interface, arguments.channel, arguments.bitrate
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
+    if arguments.interface is not None:
+        bus = bus_settings(*bus)
+    interface, channel, bit_rate = bus
     stopped = StopFlag.on_signals()
     console = Console(stderr=True)
     out = arguments.out or Path("out") / scenario.name
@@ -143,10 +156,10 @@ def _run(arguments: argparse.Namespace) -> int:
                 scenario=scenario,
                 controller=arguments.controller,
                 record_directory=folder.scratch,
-                bit_rate=arguments.bitrate,
+                bit_rate=bit_rate,
                 dbc=arguments.dbc,
-                interface=arguments.interface,
-                channel=arguments.channel,
+                interface=interface,
+                channel=channel,
                 rt_ratio=arguments.rt_ratio,
                 start_timeout_s=arguments.start_timeout,
                 answer_timeout_s=arguments.answer_timeout,
@@ -233,6 +246,12 @@ def _bus(arguments: argparse.Namespace) -> int:
         if hub.dropped:
             print(f"hil: {hub.dropped} frames were dropped for slow listeners", file=sys.stderr)
     return EXIT_OK
+
+
+def _vcan_status(_: argparse.Namespace) -> int:
+    status = socketcan_status()
+    print(status.line)
+    return EXIT_OK if status.usable else EXIT_UNUSABLE
 
 
 def _list(_: argparse.Namespace) -> int:

@@ -93,7 +93,7 @@ def result_of(
     rms_mm = _finite(np.sqrt(np.nanmean(error_mm**2))) if np.isfinite(error_mm).any() else None
     max_mm = _finite(np.nanmax(np.abs(error_mm))) if np.isfinite(error_mm).any() else None
     limits = scenario.limits.get(options.controller)
-    timing = timing_in(recording, trace, contract, options.bit_rate, mode)
+    timing = timing_in(recording, trace, contract, options.wire_bit_rate, mode)
     complete = not recording.ending
     within, verdict = None, ""
     if complete:
@@ -114,8 +114,8 @@ def result_of(
         "within_limits": within,
         "verdict": verdict,
         "paper": scenario.paper.get(options.controller),
-        "bit_rate": options.bit_rate,
-        "bus_load_percent": bus_load_percent(recording, contract, options.bit_rate),
+        "bit_rate": options.wire_bit_rate,
+        "bus_load_percent": bus_load_percent(recording, contract, options.wire_bit_rate),
         "timing": timing.summary(),
         "timing_limits": scenario.timing.given() or None,
         "bus_frames": len(recording.traffic),

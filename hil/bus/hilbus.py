@@ -18,8 +18,8 @@ class HilBus(BusABC):
 
     Parameters
     ----------
-    channel : str
-        The hub's channel.
+    channel : str or int
+        The hub's channel; python-can makes a number of one that consists of digits.
     can_filters : optional
         As in python-can; filtering is done in software.
     greeted : tuple, optional
@@ -33,11 +33,12 @@ class HilBus(BusABC):
 
     def __init__(
         self,
-        channel: str,
+        channel: str | int,
         can_filters: Any = None,
         greeted: tuple[socket.socket, dict[str, Any]] | None = None,
         **kwargs: Any,
     ) -> None:
+        channel = str(channel)
         try:
             self._link, answer = greeted or link.connect(channel, {"role": "bus"})
         except LinkError as error:

@@ -26,7 +26,7 @@ def run_inprocess(options: RunOptions) -> Recording:
     supervisor = Supervisor(contract, options.scenario, options.controller)
     plant = Plant(contract, PlantParameters())
     controller = Controller(contract, Tuning().calibration().to_bytes())
-    wire = make_wire(contract, options.bit_rate)
+    wire = make_wire(contract, options.wire_bit_rate)
     for node, clock in ((supervisor, None), (plant, None), (controller, Clock(PHASE_NS))):
         wire.start(wire.attach(node, clock))
     ready_s = time.perf_counter()

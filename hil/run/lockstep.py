@@ -11,6 +11,7 @@ from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from firmware_py.node import PHASE_NS
 from hil.bus.hub import Hub, NodeGoneError
+from hil.bus.opening import BusSettings
 from hil.bus.wire import Clock, Port, Wire
 from hil.run.inprocess import make_wire, play, traffic_of
 from hil.run.node_processes import NodeProcesses, load_record
@@ -36,11 +37,11 @@ def run_lockstep(options: RunOptions) -> Recording:
     begin_s = time.perf_counter()
     contract = Contract.load(options.dbc)
     supervisor = Supervisor(contract, options.scenario, options.controller)
-    wire = make_wire(contract, options.bit_rate)
+    wire = make_wire(contract, options.wire_bit_rate)
     channel = options.channel or f"run-{os.getpid()}"
     with (
         Hub(wire, channel, expected=_NODES, answer_timeout_s=options.answer_timeout_s) as hub,
-        NodeProcesses(options, "hilbus", channel) as processes,
+        NodeProcesses(options, BusSettings("hilbus", channel, options.wire_bit_rate)) as processes,
     ):
         _wait_for_nodes(hub, processes, options)
         with _pinned_to_one_core(processes.pids):

@@ -18,6 +18,7 @@ from dbc.record import Record
 from hil.bus import link
 from hil.bus.hilbus import HilBus
 from hil.bus.link import LinkError
+from hil.bus.opening import bus_settings, open_bus
 from hil.bus.wire import Clock
 from hil.run.realtime import DuplicateNodeError, RealtimeNode
 from hil.run.stopping import StopFlag, orphaned
@@ -39,6 +40,7 @@ def add_node_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-i", "--interface", metavar="I", help="python-can interface, e.g. socketcan, hilbus")
     parser.add_argument("-c", "--channel", metavar="C", help="its channel, e.g. vcan0")
     parser.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s, for adapters that set it")
+    parser.epilog = "What -i, -c and -b leave open comes from python-can's configuration, e.g. ~/.canrc."
     parser.add_argument(
         "--rt-ratio", type=ratio, default=Fraction(1), metavar="R", help="node time per wall time"
     )
@@ -79,19 +81,20 @@ def node_main(
     try:
         if arguments.record:
             arguments.record.mkdir(parents=True, exist_ok=True)
-        if arguments.interface == "hilbus" and arguments.channel:
-            connection, answer = _attach(arguments.channel, node)
+        settings = bus_settings(arguments.interface, arguments.channel, arguments.bitrate)
+        if settings.interface == "hilbus":
+            connection, answer = _attach(settings.channel, node)
             if answer["virtual"]:
                 with _recorded(node, arguments.record):
-                    serve(node, connection, arguments.channel, arguments.record)
+                    serve(node, connection, settings.channel, arguments.record)
             else:
-                bus: can.BusABC = HilBus(arguments.channel, greeted=(connection, answer))
+                bus: can.BusABC = HilBus(settings.channel, greeted=(connection, answer))
                 _run_in_wall_time(node, bus, arguments, clock)
         else:
-            _run_in_wall_time(node, _open_bus(arguments), arguments, clock)
+            _run_in_wall_time(node, open_bus(*settings), arguments, clock)
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
-    except (DuplicateNodeError, can.CanInitializationError, can.CanInterfaceNotImplementedError) as error:
+    except (DuplicateNodeError, can.CanInitializationError) as error:
         return _complain(parser, error, EXIT_USAGE)
     except (LinkError, can.CanError, OSError) as error:
         return _complain(parser, error, EXIT_BROKEN)
@@ -106,15 +109,6 @@ def _recorded(node: RecordingNode, directory: Path | None) -> Iterator[None]:
     finally:
         if directory is not None:
             node.record.save(directory / f"{node.name}.npz")
-
-
-def _open_bus(arguments: argparse.Namespace) -> can.BusABC:
-    given = {key: getattr(arguments, key) for key in ("interface", "channel", "bitrate")}
-    try:
-        return can.Bus(**{key: value for key, value in given.items() if value is not None})
-    except (can.CanError, OSError, ValueError, TypeError) as error:
-        where = f"{arguments.interface or 'the configured interface'} channel {arguments.channel!r}"
-        raise can.CanInitializationError(f"cannot open {where} ({error}): check -i and -c") from error
 
 
 def serve(node: RecordingNode, connection: socket.socket, channel: str, record: Path | None) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hil.bus.opening import BusSettings
 from hil.run.options import BenchError, RunOptions
 
 MODULES = {"plant": "plant_sim", "controller": "firmware_py"}
@@ -23,15 +24,17 @@ class NodeProcesses:
     ----------
     options : RunOptions
         Real-time ratio, DBC and record directory are handed on.
-    interface, channel : str
-        python-can interface and channel.
+    bus : BusSettings
+        The bus they are to meet on.
     """
 
-    def __init__(self, options: RunOptions, interface: str, channel: str) -> None:
+    def __init__(self, options: RunOptions, bus: BusSettings) -> None:
         self._logs: dict[str, Path] = {}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        arguments = ["-i", interface, "-c", channel, "--rt-ratio", str(options.rt_ratio)]
+        arguments = ["-i", bus.interface, "-c", bus.channel, "--rt-ratio", str(options.rt_ratio)]
         arguments += ["--record", str(options.record_directory), "--parent", str(os.getpid())]
+        if bus.bit_rate is not None:
+            arguments += ["-b", str(bus.bit_rate)]
         if options.dbc is not None:
             arguments += ["--dbc", str(options.dbc)]
         for name, module in MODULES.items():

@@ -39,8 +39,9 @@ class RunOptions:
         Control law, one of `hil.scenario.CONTROLLERS`.
     record_directory : Path
         Private directory for what processes leave.
-    bit_rate : int
-        Bit/s of the wire.
+    bit_rate : int or None
+        Bit/s; None is `DEFAULT_BIT_RATE` on a simulated wire, and on an adapter what python-can's
+        configuration or the adapter itself says.
     dbc : Path or None
         Another DBC than the packaged one.
     interface, channel : str or None
@@ -58,7 +59,7 @@ class RunOptions:
     scenario: Scenario
     controller: str
     record_directory: Path
-    bit_rate: int = DEFAULT_BIT_RATE
+    bit_rate: int | None = None
     dbc: Path | None = None
     interface: str | None = None
     channel: str | None = None
@@ -67,6 +68,11 @@ class RunOptions:
     answer_timeout_s: float = 10.0
     progress: Callable[[float], None] = lambda simulated_s: None
     stopped: StopFlag = field(default_factory=StopFlag)
+
+    @property
+    def wire_bit_rate(self) -> int:
+        """Bit/s of the wire; on an adapter that was not told one, an assumption."""
+        return self.bit_rate or DEFAULT_BIT_RATE
 
 
 @dataclass(frozen=True, slots=True)

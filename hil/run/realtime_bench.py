@@ -14,6 +14,7 @@ import numpy as np
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from hil.bus.messages import to_frame
+from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock
 from hil.run.node_processes import NodeProcesses, load_record
 from hil.run.options import HUB_GREETING, INTERRUPTED, BenchError, InterruptedRunError, Recording, RunOptions
@@ -27,20 +28,21 @@ _CHECK_INTERVAL_S = 0.1
 def run_realtime(options: RunOptions) -> Recording:
     """Run supervisor and log here, plant and firmware in processes of their own.
 
-    Without an interface, a hub of our own serves `hilbus`.
+    Without an interface, a hub of our own serves `hilbus`, whatever python-can's configuration names.
 
     Raises
     ------
+    can.CanInitializationError
+        If the bus cannot be opened.
     BenchError
-        If the bus cannot be opened, or a side does not come up or is lost.
+        If a side does not come up or is lost.
     """
     begin_s = time.perf_counter()
     contract = Contract.load(options.dbc)
     supervisor = Supervisor(contract, options.scenario, options.controller)
-    with _bus_to_use(options) as (interface, channel):
-        listener = _open(interface, channel, options.bit_rate)
-        own = _open(interface, channel, options.bit_rate)
-        with listener, own, NodeProcesses(options, interface, channel) as processes:
+    with _bus_to_use(options) as settings:
+        listener, own = open_bus(*settings), open_bus(*settings)
+        with listener, own, NodeProcesses(options, settings) as processes:
             heard: list[tuple[int, can.Message]] = []
             _wait_for_both(listener, contract, processes, options)
             notifier = can.Notifier(
@@ -82,15 +84,14 @@ def run_realtime(options: RunOptions) -> Recording:
 
 
 @contextmanager
-def _bus_to_use(options: RunOptions) -> Iterator[tuple[str, str]]:
-    """Give interface and channel; without an interface, a hub process for the time of the run."""
+def _bus_to_use(options: RunOptions) -> Iterator[BusSettings]:
+    """Say which bus; without an interface, that of a hub process for the time of the run."""
     if options.interface is not None:
-        if options.channel is None:
-            raise BenchError("--interface needs --channel, e.g. -i socketcan -c vcan0")
-        yield options.interface, options.channel
+        yield bus_settings(options.interface, options.channel, options.bit_rate)
         return
     channel = options.channel or f"run-{os.getpid()}"
-    command = [sys.executable, "-m", "hil", "bus", "--channel", channel, "--bitrate", str(options.bit_rate)]
+    bit_rate = options.wire_bit_rate
+    command = [sys.executable, "-m", "hil", "bus", "--channel", channel, "--bitrate", str(bit_rate)]
     hub = subprocess.Popen(
         [*command, "--parent", str(os.getpid())],
         stdin=subprocess.DEVNULL,
@@ -103,17 +104,10 @@ def _bus_to_use(options: RunOptions) -> Iterator[tuple[str, str]]:
         said = hub.stdout.readline().decode(errors="replace").strip()
         if not said.startswith(HUB_GREETING):
             raise BenchError(said.removeprefix("hil: "))
-        yield "hilbus", channel
+        yield BusSettings("hilbus", channel, bit_rate)
     finally:
         hub.terminate()
         hub.wait()
-
-
-def _open(interface: str, channel: str, bit_rate: int) -> can.BusABC:
-    try:
-        return can.Bus(interface=interface, channel=channel, bitrate=bit_rate)
-    except (can.CanError, OSError, ValueError) as error:
-        raise BenchError(f"cannot open {interface} channel {channel!r}: {error}") from error
 
 
 def _wait_for_both(

@@ -218,7 +218,7 @@ def test_an_interface_in_virtual_time(capsys, out):
 
 def test_an_interface_without_a_channel(capsys, out):
     line = refused(capsys, "run", "sine", "--mode", "realtime", "-i", "socketcan", "--out", out)
-    assert "--interface needs --channel" in line
+    assert "no channel for socketcan: give -i and -c" in line
 
 
 def test_an_interface_that_does_not_exist(capsys, out):

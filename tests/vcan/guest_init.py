@@ -21,7 +21,8 @@ RMEM_DEFAULT_BYTES = 32 << 20  # a CAN socket with the kernel's default loses fr
 
 RB_POWER_OFF = 0x4321FEDC
 SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1
-RTM_NEWLINK, NLM_F_REQUEST, NLM_F_ACK, NLM_F_CREATE, NLM_F_EXCL = 16, 1, 4, 0x400, 0x200
+RTM_NEWLINK, RTM_DELLINK = 16, 17
+NLM_F_REQUEST, NLM_F_ACK, NLM_F_CREATE, NLM_F_EXCL = 1, 4, 0x400, 0x200
 SIZEOF_IFINFOMSG, IFLA_IFNAME, IFLA_LINKINFO, IFLA_INFO_KIND = 16, 3, 18, 1
 
 LIBC = ctypes.CDLL(None, use_errno=True)
@@ -37,7 +38,7 @@ def main(run_dir: Path) -> None:
             load_module(Path(path))
         create_link("vcan0", "vcan")
         for name in ("lo", "vcan0"):
-            set_up(name)
+            set_link(name, up=True)
         status = run(job["command"], job["cwd"], job["env"])
         (run_dir / "status").write_text(str(status))
     except Exception:
@@ -85,13 +86,23 @@ def create_link(name: str, kind: str) -> None:
     """Create a network device, as ``ip link add dev NAME type KIND`` does."""
     device_kind = attribute(IFLA_LINKINFO, attribute(IFLA_INFO_KIND, kind.encode()))
     device_name = attribute(IFLA_IFNAME, name.encode() + b"\0")
-    body = bytes(SIZEOF_IFINFOMSG) + device_name + device_kind
-    flags = NLM_F_REQUEST | NLM_F_ACK | NLM_F_CREATE | NLM_F_EXCL
+    request_link(name, RTM_NEWLINK, NLM_F_CREATE | NLM_F_EXCL, device_name + device_kind)
+
+
+def delete_link(name: str) -> None:
+    """Remove a network device, as ``ip link delete NAME`` does."""
+    request_link(name, RTM_DELLINK, 0, attribute(IFLA_IFNAME, name.encode() + b"\0"))
+
+
+def request_link(name: str, kind: int, flags: int, attributes: bytes) -> None:
+    """Ask the kernel for a change of its network devices."""
+    body = bytes(SIZEOF_IFINFOMSG) + attributes
+    header = struct.pack("IHHII", 16 + len(body), kind, NLM_F_REQUEST | NLM_F_ACK | flags, 1, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
-        netlink.send(struct.pack("IHHII", 16 + len(body), RTM_NEWLINK, flags, 1, 0) + body)
+        netlink.send(header + body)
         error = -struct.unpack_from("i", netlink.recv(4096), 16)[0]
     if error:
-        raise OSError(error, os.strerror(error), f"create {name}")
+        raise OSError(error, os.strerror(error), name)
 
 
 def attribute(kind: int, payload: bytes) -> bytes:
@@ -99,12 +110,13 @@ def attribute(kind: int, payload: bytes) -> bytes:
     return struct.pack("HH", 4 + len(payload), kind) + payload + bytes(-len(payload) % 4)
 
 
-def set_up(name: str) -> None:
-    """Set a network device up, as ``ip link set up NAME`` does."""
+def set_link(name: str, *, up: bool) -> None:
+    """Set a network device up or down, as ``ip link set up NAME`` does."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         request = struct.pack("16sH14x", name.encode(), 0)
         flags = struct.unpack_from("H", fcntl.ioctl(control, SIOCGIFFLAGS, request), 16)[0]
-        fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sH14x", name.encode(), flags | IFF_UP))
+        flags = flags | IFF_UP if up else flags & ~IFF_UP
+        fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sH14x", name.encode(), flags))
 
 
 def run(command: list[str], cwd: str, env: dict[str, str]) -> int:
