@@ -171,11 +171,13 @@ def _run_in_wall_time(
         runner.listen_for_duplicate()
         print(f"{node.name} is on {bus.channel_info}; Ctrl-C ends it", file=sys.stderr, flush=True)
         with _recorded(node, arguments.record):
+            runner.start()
             runner.run(keep_running)
     late = runner.lateness.summary()
     print(
         f"{node.name}: timer late by {late['p50_us']:.0f} µs (median), {late['p99_us']:.0f} µs (p99), "
-        f"{late['max_us']:.0f} µs (max); {late['overruns']} periods missed",
+        f"{late['p999_us']:.0f} µs (p99.9), {late['max_us']:.0f} µs (max); "
+        f"{late['overruns']} periods missed in {late['stalls']} stalls; scheduler {late['scheduler']}",
         file=sys.stderr,
     )
 

@@ -18,7 +18,7 @@ from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock
 from hil.run.node_processes import NodeProcesses, load_record
 from hil.run.options import HUB_GREETING, INTERRUPTED, BenchError, InterruptedRunError, Recording, RunOptions
-from hil.run.realtime import RealtimeNode
+from hil.run.realtime import RealtimeNode, shared_ns
 from hil.supervisor import Supervisor
 
 _POLL_S = 0.05
@@ -52,6 +52,7 @@ def run_realtime(options: RunOptions) -> Recording:
             ready_s = time.perf_counter()
             broken = ""
             try:
+                runner.start()
                 runner.run(_until_done(supervisor, processes, options))
             except (BenchError, can.CanError, OSError) as error:
                 broken = str(error)
@@ -154,7 +155,7 @@ def _traffic(heard: list[tuple[int, can.Message]], ratio: Fraction) -> np.ndarra
     offset_ns = min((ns - round(message.timestamp * 1e9) for ns, message in data), default=0)
     rows = [
         (
-            (round(message.timestamp * 1e9) + offset_ns) * ratio.numerator // ratio.denominator,
+            shared_ns(round(message.timestamp * 1e9) + offset_ns, ratio),
             *to_frame(message),
         )
         for _, message in data
