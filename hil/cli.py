@@ -34,7 +34,7 @@ from hil.run.options import (
     InterruptedRunError,
     RunOptions,
 )
-from hil.run.realtime_bench import run_realtime
+from hil.run.realtime_rig import run_realtime
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
 from hil.supervisor import BRING_UP_S

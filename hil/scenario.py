@@ -81,7 +81,11 @@ class Scenario:
 
     def reference_m(self) -> np.ndarray:
         """Return the reference at the start of each period, m."""
-        return REFERENCES[self.reference](np.arange(self.periods) * PERIOD_S)
+        return self.position_m(np.arange(self.periods) * PERIOD_S)
+
+    def position_m(self, time_s: np.ndarray) -> np.ndarray:
+        """Return the reference at given times from its start, m."""
+        return REFERENCES[self.reference](time_s)
 
 
 def builtin_names() -> list[str]:

@@ -1,6 +1,10 @@
-"""The supervisor node: brings the machine up, then plays the setpoints and load steps of a scenario."""
+"""The supervisor node: brings the machine up, then sends setpoints and mode commands as it is steered."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from heapq import heappop, heappush
+from itertools import count
+
+import numpy as np
 
 from dbc.contract import Contract
 from dbc.frame import Frame
@@ -8,63 +12,93 @@ from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from hil.references import setpoint_counts
-from hil.scenario import CONTROLLERS, Scenario
+from hil.scenario import CONTROLLERS, PERIOD_S
 
 BRING_UP_PERIODS = 100
-"""Periods from the supervisor's start to the first one of the reference: the drive is enabled in them."""
+"""Periods from the supervisor's start to the first one of a scenario: the drive is enabled in them."""
 
 BRING_UP_S = BRING_UP_PERIODS * PERIOD_NS * 1e-9
 
+Reference = Callable[[np.ndarray], np.ndarray]
+"""Position in m over an array of times in s, from the period at which it begins."""
+
 _ENABLE_PERIOD = 20
-_BRING_UP_COMMANDS = (1, 2, _ENABLE_PERIOD)
+_BRING_UP_COMMANDS = (1, 2)
 """The first only starts the receiver's counter; the second, without Enable, arms the controller."""
 
 _COMMAND_PERIODS = 100
+_CHUNK = 1000
 
 
 class Supervisor:
-    """Plays a scenario: setpoints every period, mode commands, load steps over the bench channel.
+    """Sends a setpoint every period, and mode commands and loads when they change.
+
+    It may be steered while it runs: what is asked for takes effect with the next period, or with a later
+    one that is named. Steering from another thread is safe.
 
     Parameters
     ----------
     contract : Contract
         The DBC.
-    scenario : Scenario
-        What to play.
     controller : str
         One of `CONTROLLERS`.
+    position_m : float
+        Initial position of the machine, held until there is a reference.
+
+    Attributes
+    ----------
+    record : Record
+        One row per period.
+    start_ns : int
+        Bus time of the scenario's first period.
+    next_period : int
+        Number of the next period since power-on.
+    silent : set of int
+        Ids of own messages that are held back.
     """
 
     name = "supervisor"
     accepts: frozenset[int] = frozenset()
     latched: frozenset[int] = frozenset()
 
-    def __init__(self, contract: Contract, scenario: Scenario, controller: str) -> None:
-        self.record = Record(("time_ns", "setpoint_raw", "load_n"), "q")
+    def __init__(self, contract: Contract, controller: str, position_m: float = 0.0) -> None:
+        self.record = Record(("time_ns", "reference_m", "setpoint_raw", "load_n"), "d")
         self.start_ns = 0
-        self._setpoints: Sequence[int] = setpoint_counts(scenario.reference_m()).tolist()
-        self._loads = {round(time_s * 1e9) // PERIOD_NS: round(force_n) for time_s, force_n in scenario.load}
-        self._law = 1 + CONTROLLERS.index(controller)
+        self.next_period = 0
+        self.silent: set[int] = set()
         self._setpoint = contract.position_setpoint
         self._command = contract.controller_command
         self._bench_control = contract.bench_control
         self._bench_load = contract.bench_load
         self._protect_setpoint = self._setpoint.protector().protect
         self._protect_command = self._command.protector().protect
-        self._load_n = 0
-        self._origin_ns = 0
-        self._next_period = 0
         self.transmits = frozenset({self._setpoint.can_id, self._command.can_id})
+        self._origin_ns = 0
+        self._position_m = position_m
+        self._reference: Reference | None = None
+        self._reference_begin = 0
+        self._chunk: tuple[list[float], list[int]] = ([], [])
+        self._chunk_begin = 0
+        self._words = {"enable": 0, "law": 1 + CONTROLLERS.index(controller), "fault_reset": 0, "load_n": 0}
+        self._plan: list[tuple[int, int, dict[str, int | Reference]]] = []
+        self._planned = count()
+        self.plan(_ENABLE_PERIOD, enable=1)
 
-    @property
-    def played_periods(self) -> int:
-        """Periods since power-on that are over, missed ones included."""
-        return self._next_period
+    def plan(self, period: int, **words: int | Reference) -> None:
+        """Change something in a period that is to come.
 
-    @property
-    def periods(self) -> int:
-        """Periods from power-on to the end of the scenario."""
-        return BRING_UP_PERIODS + len(self._setpoints)
+        Parameters
+        ----------
+        period : int
+            Since power-on; one that is over means the next.
+        **words
+            `enable`, `fault_reset`, `load_n` (int) or `reference` (`Reference`).
+        """
+        heappush(self._plan, (period, next(self._planned), words))
+
+    def steer(self, **words: int | Reference) -> None:
+        """Change something with the next period; see `plan`."""
+        self.plan(self.next_period, **words)
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: the machine is put to its initial state with the first period."""
@@ -75,35 +109,61 @@ class Supervisor:
     def on_timer(self, now_ns: int) -> Actions:
         """Send this period's setpoint, and what else is due."""
         period = (now_ns - self._origin_ns) // PERIOD_NS
-        k = period - BRING_UP_PERIODS
-        raw = self._setpoints[min(max(k, 0), len(self._setpoints) - 1)]
-        frames = [self._setpoint.frame(self._protect_setpoint(self._setpoint.pack(raw)))]
-        if period == 0:
-            frames.append(self._reset_frame())
-            frames.append(self._load_frame())
-        if period in _BRING_UP_COMMANDS or (period > 0 and period % _COMMAND_PERIODS == 0):
-            frames.append(self._command_frame(period >= _ENABLE_PERIOD))
-        if k in self._loads:
-            self._load_n = self._loads[k]
-            frames.append(self._load_frame())
-        self.record.append((now_ns, raw, self._load_n))
-        self._next_period = period + 1
-        wake_ns = self._origin_ns + self._next_period * PERIOD_NS
-        return Actions(wake_ns, tuple((now_ns, frame) for frame in frames))
+        frames = self._frames_of_change(period)
+        reference_m, raw = self._position_in(period)
+        if self._setpoint.can_id not in self.silent:
+            frames.insert(0, self._setpoint.frame(self._protect_setpoint(self._setpoint.pack(raw))))
+        self.record.append((now_ns, reference_m, raw, self._words["load_n"]))
+        self.next_period = period + 1
+        wake_ns = self._origin_ns + self.next_period * PERIOD_NS
+        return Actions(wake_ns, tuple([(now_ns, frame) for frame in frames]))
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
         """Hear nothing: the acceptance filter is empty."""
         return NOTHING
 
-    def _command_frame(self, enable: bool) -> Frame:
-        message = self._command
-        payload = self._protect_command(message.pack(int(enable), self._law, 0))
-        return message.frame(payload)
+    def _frames_of_change(self, period: int) -> list[Frame]:
+        """Return the frames beside the setpoint, in the order in which they are sent."""
+        frames = []
+        loaded = period == 0
+        commanded = period in _BRING_UP_COMMANDS or (period > 0 and period % _COMMAND_PERIODS == 0)
+        while self._plan and self._plan[0][0] <= period:
+            _, _, words = heappop(self._plan)
+            if reference := words.pop("reference", None):
+                assert callable(reference)
+                self._reference, self._reference_begin = reference, period
+                self._chunk, self._chunk_begin = ([], []), period
+            loaded |= "load_n" in words
+            commanded |= bool(words.keys() & {"enable", "fault_reset"})
+            self._words |= words  # type: ignore[arg-type]
+        if period == 0:
+            frames.append(self._reset_frame())
+        if commanded and self._command.can_id not in self.silent:
+            frames.append(self._command_frame())
+        if loaded:
+            frames.append(self._bench_load.frame(self._bench_load.pack(self._words["load_n"])))
+        return frames
+
+    def _position_in(self, period: int) -> tuple[float, int]:
+        """Return the reference of a period, in m and in counts of the setpoint."""
+        if self._reference is None:
+            return self._position_m, self._initial_raw()
+        index = period - self._chunk_begin
+        if index >= len(self._chunk[0]):
+            self._chunk_begin, index = period, 0
+            elapsed = np.arange(period, period + _CHUNK) - self._reference_begin
+            reference_m = self._reference(elapsed * PERIOD_S)
+            self._chunk = reference_m.tolist(), setpoint_counts(reference_m).tolist()
+        return self._chunk[0][index], self._chunk[1][index]
+
+    def _initial_raw(self) -> int:
+        return int(setpoint_counts(np.array(self._position_m)))
+
+    def _command_frame(self) -> Frame:
+        message, words = self._command, self._words
+        payload = message.pack(words["enable"], words["law"], words["fault_reset"])
+        return message.frame(self._protect_command(payload))
 
     def _reset_frame(self) -> Frame:
         message = self._bench_control
-        return message.frame(message.pack(BenchCommand.RESET, 0, self._setpoints[0]))
-
-    def _load_frame(self) -> Frame:
-        message = self._bench_load
-        return message.frame(message.pack(self._load_n))
+        return message.frame(message.pack(BenchCommand.RESET, 0, self._initial_raw()))

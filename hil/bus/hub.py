@@ -80,6 +80,10 @@ class RemoteNode:
         """Let the process write its record now."""
         self.ask(link.pack_event(link.SAVE), bytearray(link.MAX_PACKET))
 
+    def forget(self) -> None:
+        """Let the process begin its record anew."""
+        self.ask(link.pack_event(link.FORGET), bytearray(link.MAX_PACKET))
+
     def stop(self) -> None:
         """Tell the process to write its record and end."""
         with suppress(OSError):  # it may have ended by itself

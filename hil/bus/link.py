@@ -20,7 +20,7 @@ from dbc.node import NOTHING, Actions, Node
 
 PROTOCOL_VERSION = 2
 MAX_PACKET = 65536
-START, TIMER, FRAME, STOP, SAVE = range(5)
+START, TIMER, FRAME, STOP, SAVE, FORGET = range(6)
 NO_WAKE = -(1 << 63)
 
 _FRAME = struct.Struct("<IB3xQ")

@@ -1,69 +1,167 @@
-"""A run with all nodes in this process, in virtual time."""
+"""Virtual time, and a rig with all nodes in this process."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Self
 
 import numpy as np
 
 from dbc.contract import Contract
-from dbc.node import PERIOD_NS
+from dbc.node import PERIOD_NS, Node
 from firmware_py.node import PHASE_NS, Controller
 from firmware_py.tuning import Tuning
-from hil.bus.wire import Clock, Wire
-from hil.run.options import INTERRUPTED, Recording, RunOptions
+from hil.bus import link
+from hil.bus.wire import Clock, Port, Wire
+from hil.run.options import INTERRUPTED, Recording, RigOptions, RunOptions
+from hil.run.rig import play
 from hil.supervisor import Supervisor
 from plant_sim.node import Plant
 from plant_sim.parameters import PlantParameters
 
 SERVICE_NS = 10 * PERIOD_NS
-"""Virtual time between looks at stop requests, progress and listeners."""
+"""Virtual time between looks at stop requests and listeners."""
+
+CLOCKS = {"supervisor": Clock(), "plant": Clock(), "controller": Clock(PHASE_NS)}
+
+Records = dict[str, dict[str, np.ndarray] | None]
 
 
 def run_inprocess(options: RunOptions) -> Recording:
-    """Run all nodes in this process."""
-    begin_s = time.perf_counter()
-    contract = Contract.load(options.dbc)
-    supervisor = Supervisor(contract, options.scenario, options.controller)
-    plant = Plant(contract, PlantParameters())
-    controller = Controller(contract, Tuning().calibration().to_bytes())
-    wire = make_wire(contract, options.wire_bit_rate)
-    for node, clock in ((supervisor, None), (plant, None), (controller, Clock(PHASE_NS))):
-        wire.start(wire.attach(node, clock))
-    ready_s = time.perf_counter()
-    ending = play(wire, supervisor, options, lambda: None)
-    wall_s = time.perf_counter() - ready_s
-    return Recording(
-        traffic=traffic_of(wire),
-        supervisor=supervisor.record.columns_by_name(),
-        plant=plant.record.columns_by_name(),
-        controller=controller.record.columns_by_name(),
-        start_ns=supervisor.start_ns,
-        simulated_s=wire.now_ns / 1e9,
-        wall_s=wall_s,
-        startup_s=ready_s - begin_s,
-        ending=ending,
-    )
+    """Play a scenario with all nodes in this process."""
+    with InprocessRig(options) as rig:
+        return play(rig, options)
+
+
+class InprocessRig:
+    """All nodes in this process; every session has new ones."""
+
+    mode = "inprocess"
+
+    def __init__(self, options: RigOptions) -> None:
+        self.contract = Contract.load(options.dbc)
+        self._options = options
+        self._begin_s = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.finish()
+
+    def begin(self, controller: str, position_m: float) -> "VirtualSession":
+        """Begin a run; see `hil.run.rig.Rig`."""
+        plant = Plant(self.contract, PlantParameters())
+        firmware = Controller(self.contract, Tuning().calibration().to_bytes())
+
+        def records() -> Records:
+            return {node.name: node.record.columns_by_name() for node in (plant, firmware)}
+
+        return VirtualSession(
+            self._options,
+            make_wire(self.contract, self._options.wire_bit_rate),
+            Supervisor(self.contract, controller, position_m),
+            [plant, firmware],
+            records,
+            begin_s=self._begin_s,
+        )
+
+    def finish(self) -> str:
+        """Have nothing to end."""
+        return ""
+
+
+class VirtualSession:
+    """A run in virtual time; see `hil.run.rig.Session`.
+
+    Parameters
+    ----------
+    options : RigOptions
+        What the rig was asked for.
+    wire : Wire
+        A new one.
+    supervisor : Supervisor
+        A new one.
+    nodes : sequence of Node or Askable
+        The others.
+    records : callable
+        Returns the other nodes' records by name.
+    service : callable
+        Called every `SERVICE_NS` of bus time.
+    begin_s : float
+        `time.perf_counter` when start-up began.
+    """
+
+    def __init__(
+        self,
+        options: RigOptions,
+        wire: Wire,
+        supervisor: Supervisor,
+        nodes: Sequence[Node | link.Askable],
+        records: Callable[[], Records],
+        service: Callable[[], None] = lambda: None,
+        begin_s: float = 0.0,
+    ) -> None:
+        self.supervisor = supervisor
+        self.ending = ""
+        self.broken = False
+        self.wire: Wire = wire
+        self._options = options
+        self._records = records
+        self._service = service
+        self.ports: dict[str, Port] = {}
+        for node in (supervisor, *nodes):
+            self.ports[node.name] = wire.attach(node, CLOCKS[node.name])
+        self._startup_s = time.perf_counter() - begin_s
+        self._wall_s = 0.0
+        self._advance(self._power_on)
+
+    def run_to(self, period: int) -> None:
+        """Go on to the start of a period, counted from power-on."""
+        self._advance(lambda: self._run(period * PERIOD_NS))
+
+    def recording(self) -> Recording:
+        """Return what there is so far."""
+        records = self._records()
+        return Recording(
+            traffic=self.wire.traffic,
+            supervisor=self.supervisor.record.columns_by_name(),
+            plant=records["plant"],
+            controller=records["controller"],
+            start_ns=self.supervisor.start_ns,
+            simulated_s=self.wire.now_ns / 1e9,
+            wall_s=self._wall_s,
+            startup_s=self._startup_s,
+            ending=self.ending,
+            broken=self.broken,
+            notes=self._notes(),
+        )
+
+    def end(self) -> None:
+        """Have nothing to do: virtual time stands still."""
+
+    def _power_on(self) -> None:
+        for port in self.ports.values():
+            self.wire.start(port)
+
+    def _run(self, end_ns: int) -> None:
+        while not self.ending and self.wire.now_ns < end_ns:
+            self.wire.run(min(self.wire.now_ns + SERVICE_NS, end_ns))
+            self._service()
+            if self._options.stopped.is_set():
+                self.ending = INTERRUPTED
+
+    def _advance(self, step: Callable[[], None]) -> None:
+        begin_s = time.perf_counter()
+        try:
+            step()
+        finally:
+            self._wall_s += time.perf_counter() - begin_s
+
+    def _notes(self) -> dict[str, object]:
+        return {}
 
 
 def make_wire(contract: Contract, bit_rate: int) -> Wire:
     """Return a wire on which the contract's bench channel is out of band."""
     out_of_band = frozenset(message.can_id for message in contract.messages if message.bench_channel)
     return Wire(bit_rate, out_of_band)
-
-
-def play(wire: Wire, supervisor: Supervisor, options: RunOptions, service: Callable[[], None]) -> str:
-    """Run the wire to the end of the scenario; return what ended it earlier, or nothing."""
-    end_ns = supervisor.periods * PERIOD_NS
-    while True:
-        wire.run(min(wire.now_ns + SERVICE_NS, end_ns))
-        service()
-        options.progress(wire.now_ns / 1e9)
-        if wire.now_ns >= end_ns:
-            return ""
-        if options.stopped.is_set():
-            return INTERRUPTED
-
-
-def traffic_of(wire: Wire) -> np.ndarray:
-    """Return the wire's traffic as rows of end time (ns), id, dlc, data."""
-    return wire.traffic

@@ -1,21 +1,22 @@
-"""A run in virtual time with plant and firmware in processes of their own."""
+"""A rig in virtual time with plant and firmware in processes of their own."""
 
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Self
 
 import numpy as np
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
-from firmware_py.node import PHASE_NS
 from hil.bus.hub import Hub, NodeGoneError
 from hil.bus.opening import BusSettings
-from hil.bus.wire import Clock, Port, Wire
-from hil.run.inprocess import make_wire, play, traffic_of
-from hil.run.node_processes import NodeProcesses, load_record
-from hil.run.options import BenchError, InterruptedRunError, Recording, RunOptions
+from hil.bus.wire import Wire
+from hil.run.inprocess import Records, VirtualSession, make_wire
+from hil.run.node_processes import NodeProcesses, forget_record, load_record
+from hil.run.options import SIDES, BenchError, InterruptedRunError, Recording, RigOptions, RunOptions
+from hil.run.rig import play
 from hil.supervisor import Supervisor
 
 AFTERMATH_NS = 100 * PERIOD_NS
@@ -23,97 +24,143 @@ AFTERMATH_NS = 100 * PERIOD_NS
 
 _MOTOR_AT_REST_RAD_S = 0.1
 _POLL_S = 0.02
-_NODES = frozenset({"plant", "controller"})
 
 
 def run_lockstep(options: RunOptions) -> Recording:
-    """Run hub and supervisor here, plant and firmware in processes that answer event by event.
+    """Play a scenario with hub and supervisor here, plant and firmware in processes.
 
     Raises
     ------
     BenchError
         If a process does not come up, or stops answering.
     """
-    begin_s = time.perf_counter()
-    contract = Contract.load(options.dbc)
-    supervisor = Supervisor(contract, options.scenario, options.controller)
-    wire = make_wire(contract, options.wire_bit_rate)
-    channel = options.channel or f"run-{os.getpid()}"
-    with (
-        Hub(wire, channel, expected=_NODES, answer_timeout_s=options.answer_timeout_s) as hub,
-        NodeProcesses(options, BusSettings("hilbus", channel, options.wire_bit_rate)) as processes,
-    ):
-        _wait_for_nodes(hub, processes, options)
-        with _pinned_to_one_core(processes.pids):
-            ports = {
-                "supervisor": wire.attach(supervisor),
-                "plant": hub.attach("plant"),
-                "controller": hub.attach("controller", Clock(PHASE_NS)),
-            }
-            ready_s = time.perf_counter()
-            gone, ending = None, ""
-            try:
-                for port in ports.values():
-                    wire.start(port)
-                ending = play(wire, supervisor, options, hub.service)
-            except NodeGoneError as error:
-                gone, gone_ns = error, wire.now_ns
-                if error.silent:
-                    processes.kill(error.name)
-                _run_without(error, wire, ports)
-            wall_s = time.perf_counter() - ready_s
-        simulated_s = wire.now_ns / 1e9
-        exchanges = sum(wire.exchanges(port) for port in ports.values())
-        hub.close()
-        processes.wait()
-        notes: dict[str, object] = {
-            "exchanges_per_period": exchanges * PERIOD_NS / wire.now_ns,
+    with LockstepRig(options) as rig:
+        return play(rig, options)
+
+
+class LockstepRig:
+    """Hub and supervisor here, plant and firmware in processes that answer event by event.
+
+    Raises
+    ------
+    BenchError
+        On entry, if a process does not come up.
+    """
+
+    mode = "lockstep"
+
+    def __init__(self, options: RigOptions) -> None:
+        self.contract = Contract.load(options.dbc)
+        self._options = options
+        self._begin_s = time.perf_counter()
+        self._stack = ExitStack()
+        self._finished = False
+
+    def __enter__(self) -> Self:
+        options = self._options
+        channel = options.channel or f"run-{os.getpid()}"
+        bit_rate = options.wire_bit_rate
+        with ExitStack() as stack:
+            self.hub = stack.enter_context(
+                Hub(make_wire(self.contract, bit_rate), channel, SIDES, options.answer_timeout_s)
+            )
+            self.processes = stack.enter_context(
+                NodeProcesses(options, BusSettings("hilbus", channel, bit_rate), SIDES)
+            )
+            self._wait_for_nodes()
+            for pid in self.processes.pids:
+                _set_affinity(pid, _one_core())
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def begin(self, controller: str, position_m: float) -> "LockstepSession":
+        """Begin a run; see `hil.run.rig.Rig`."""
+        wire = make_wire(self.contract, self._options.wire_bit_rate)
+        self.hub.lead_to(wire)
+        for name in SIDES:
+            forget_record(self._options, name)
+            self.hub.nodes[name].forget()
+        return LockstepSession(self, wire, Supervisor(self.contract, controller, position_m), self._begin_s)
+
+    def finish(self) -> str:
+        """Let the processes write their records and end; return what went wrong with them."""
+        self._finished = True
+        self.hub.close()
+        self.processes.wait()
+        return self.processes.failure()
+
+    def records(self) -> Records:
+        """Return what the processes wrote down of themselves since the session began."""
+        if not self._finished:
+            for node in self.hub.nodes.values():
+                with suppress(NodeGoneError):
+                    node.save()
+        return {name: load_record(self._options, name) for name in SIDES}
+
+    @property
+    def options(self) -> RigOptions:
+        """What the rig was asked for."""
+        return self._options
+
+    def _wait_for_nodes(self) -> None:
+        options = self._options
+        deadline_s = time.monotonic() + options.start_timeout_s
+        while missing := sorted(SIDES - set(self.hub.nodes)):
+            self.processes.check()
+            if options.stopped.is_set():
+                raise InterruptedRunError("interrupted during start-up")
+            if time.monotonic() > deadline_s:
+                raise BenchError(
+                    f"the {missing[0]} process did not come up within {options.start_timeout_s:g} s: "
+                    "raise --start-timeout if this machine is slow"
+                )
+            self.hub.service(_POLL_S)
+
+
+class LockstepSession(VirtualSession):
+    """A run in virtual time that may lose a process."""
+
+    def __init__(self, rig: LockstepRig, wire: Wire, supervisor: Supervisor, begin_s: float) -> None:
+        self._rig = rig
+        nodes = [rig.hub.nodes[name] for name in ("plant", "controller")]
+        super().__init__(rig.options, wire, supervisor, nodes, rig.records, rig.hub.service, begin_s)
+
+    def _advance(self, step: Callable[[], None]) -> None:
+        try:
+            with _on_one_core():
+                super()._advance(step)
+        except NodeGoneError as error:
+            self._lose(error)
+
+    def _lose(self, gone: NodeGoneError) -> None:
+        """Let the others go on for a while, so that their reaction is on record, and say what happened."""
+        self.broken = True
+        gone_ns = self.wire.now_ns
+        at = f"{gone} at bus time {gone_ns / 1e9:.3f} s"
+        processes = self._rig.processes
+        if gone.silent:
+            processes.kill(gone.name)
+        self.wire.detach(self.ports[gone.name])
+        try:
+            self.wire.run(gone_ns + AFTERMATH_NS)
+        except NodeGoneError as another:
+            self.wire.detach(self.ports[another.name])
+        if gone.silent:
+            raise BenchError(f"{at}: see why it hangs, or raise --answer-timeout") from gone
+        stop = _motor_stop(self._records()["plant"], gone_ns)
+        self.ending = f"{at}{processes.exit_code(gone.name)}{stop}"
+
+    def _notes(self) -> dict[str, object]:
+        hub = self._rig.hub
+        exchanges = sum(self.wire.exchanges(port) for port in self.ports.values())
+        return {
+            "exchanges_per_period": exchanges * PERIOD_NS / self.wire.now_ns if self.wire.now_ns else 0.0,
             "listener_drops": hub.dropped,
             "injections": [(time_ns / 1e9, *frame) for time_ns, frame in hub.injections],
         }
-    plant, controller = (load_record(options, name) for name in ("plant", "controller"))
-    if gone is not None:
-        at = f"{gone} at bus time {gone_ns / 1e9:.3f} s"
-        if gone.silent:
-            raise BenchError(f"{at}: see why it hangs, or raise --answer-timeout")
-        ending = f"{at}{processes.exit_code(gone.name)}{_motor_stop(plant, gone_ns)}"
-    ending = ending or processes.failure()
-    return Recording(
-        traffic=traffic_of(wire),
-        supervisor=supervisor.record.columns_by_name(),
-        plant=plant,
-        controller=controller,
-        start_ns=supervisor.start_ns,
-        simulated_s=simulated_s,
-        wall_s=wall_s,
-        startup_s=ready_s - begin_s,
-        ending=ending,
-        broken=gone is not None or bool(processes.failure()),
-        notes=notes,
-    )
-
-
-def _wait_for_nodes(hub: Hub, processes: NodeProcesses, options: RunOptions) -> None:
-    deadline_s = time.monotonic() + options.start_timeout_s
-    while missing := sorted(_NODES - set(hub.nodes)):
-        processes.check()
-        if options.stopped.is_set():
-            raise InterruptedRunError("interrupted during start-up")
-        if time.monotonic() > deadline_s:
-            raise BenchError(
-                f"the {missing[0]} process did not come up within {options.start_timeout_s:g} s: "
-                "raise --start-timeout if this machine is slow"
-            )
-        hub.service(_POLL_S)
-
-
-def _run_without(gone: NodeGoneError, wire: Wire, ports: dict[str, Port]) -> None:
-    """Let the survivors go on for a while, so that their reaction is on record."""
-    wire.detach(ports[gone.name])
-    try:
-        wire.run(wire.now_ns + AFTERMATH_NS)
-    except NodeGoneError as another:
-        wire.detach(ports[another.name])
 
 
 def _motor_stop(plant: dict[str, np.ndarray] | None, gone_ns: int) -> str:
@@ -127,19 +174,19 @@ def _motor_stop(plant: dict[str, np.ndarray] | None, gone_ns: int) -> str:
     return "; the motor was still turning when the run ended"
 
 
+def _one_core() -> set[int]:
+    """Return the core of all partners: an exchange there costs a fraction of one across cores."""
+    return {min(os.sched_getaffinity(0))}
+
+
 @contextmanager
-def _pinned_to_one_core(pids: list[int]) -> Iterator[None]:
-    """Keep all partners on one core: an exchange there costs a fraction of one across cores."""
+def _on_one_core() -> Iterator[None]:
     allowed = os.sched_getaffinity(0)
-    core = {min(allowed)}
-    everyone = [0, *pids]
-    for pid in everyone:
-        _set_affinity(pid, core)
+    _set_affinity(0, _one_core())
     try:
         yield
     finally:
-        for pid in everyone:
-            _set_affinity(pid, allowed)
+        _set_affinity(0, allowed)
 
 
 def _set_affinity(pid: int, cores: set[int]) -> None:

@@ -136,6 +136,8 @@ def serve(node: RecordingNode, connection: socket.socket, channel: str, record: 
                 return
             if kind == link.SAVE and record is not None:
                 node.record.save(record / f"{node.name}.npz")
+            elif kind == link.FORGET:
+                node.record.clear()
             send(view[: link.pack_actions_into(answer, link.deliver(node, packet[:length]))])
 
 

@@ -4,15 +4,18 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from hil.bus.opening import BusSettings
-from hil.run.options import BenchError, RunOptions
+from hil.run.options import BenchError, RigOptions
 
 MODULES = {"plant": "plant_sim", "controller": "firmware_py"}
 _END_TIMEOUT_S = 5.0
+_LAST_MOMENTS_S = 1.0
 
 
 class NodeProcesses:
@@ -22,13 +25,15 @@ class NodeProcesses:
 
     Parameters
     ----------
-    options : RunOptions
+    options : RigOptions
         Real-time ratio, DBC and record directory are handed on.
     bus : BusSettings
         The bus they are to meet on.
+    names : collection of str
+        Which of `MODULES`.
     """
 
-    def __init__(self, options: RunOptions, bus: BusSettings) -> None:
+    def __init__(self, options: RigOptions, bus: BusSettings, names: Collection[str]) -> None:
         self._logs: dict[str, Path] = {}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         arguments = ["-i", bus.interface, "-c", bus.channel, "--rt-ratio", str(options.rt_ratio)]
@@ -37,11 +42,11 @@ class NodeProcesses:
             arguments += ["-b", str(bus.bit_rate)]
         if options.dbc is not None:
             arguments += ["--dbc", str(options.dbc)]
-        for name, module in MODULES.items():
+        for name in sorted(names):
             self._logs[name] = options.record_directory / f"{name}.stderr"
             with open(self._logs[name], "wb") as log:
                 self._processes[name] = subprocess.Popen(
-                    [sys.executable, "-m", module, *arguments],
+                    [sys.executable, "-m", MODULES[name], *arguments],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
@@ -75,6 +80,8 @@ class NodeProcesses:
 
     def exit_code(self, name: str) -> str:
         """Return how a process ended, in words for a message."""
+        with suppress(subprocess.TimeoutExpired):
+            self._processes[name].wait(_LAST_MOMENTS_S)
         code = self._processes[name].poll()
         return "" if code is None else f" (exit code {code})"
 
@@ -113,7 +120,12 @@ class NodeProcesses:
                 process.wait()
 
 
-def load_record(options: RunOptions, name: str) -> dict[str, np.ndarray] | None:
+def forget_record(options: RigOptions, name: str) -> None:
+    """Remove what a node wrote down of an earlier session."""
+    (options.record_directory / f"{name}.npz").unlink(missing_ok=True)
+
+
+def load_record(options: RigOptions, name: str) -> dict[str, np.ndarray] | None:
     """Return what a node wrote down of itself; None if it did not live to."""
     path = options.record_directory / f"{name}.npz"
     if not path.exists():

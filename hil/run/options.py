@@ -1,4 +1,4 @@
-"""What a run is asked for, and what it leaves for the measurements."""
+"""What a rig and a run are asked for, and what a run leaves for the measurements."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,6 +14,8 @@ DEFAULT_BIT_RATE = 1_000_000
 INTERRUPTED = "interrupted"
 """`Recording.ending` of a run that was asked to stop."""
 
+SIDES = frozenset({"plant", "controller"})
+"""The nodes that may be processes of their own."""
 
 HUB_GREETING = "hilbus channel"
 """What a hub process says first when it serves."""
@@ -27,16 +29,12 @@ class InterruptedRunError(BenchError):
     """The run was asked to stop before it began."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunOptions:
-    """One run.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigOptions:
+    """What a bench is made of.
 
     Attributes
     ----------
-    scenario : Scenario
-        What is played.
-    controller : str
-        Control law, one of `hil.scenario.CONTROLLERS`.
     record_directory : Path
         Private directory for what processes leave.
     bit_rate : int or None
@@ -48,31 +46,48 @@ class RunOptions:
         python-can interface of a real-time run; in lock-step the hub's channel.
     rt_ratio : Fraction
         Simulated time per wall time of a real-time run.
+    started : frozenset of str
+        Which of `SIDES` a real-time rig starts; the others are on the bus already, or come by themselves.
     start_timeout_s, answer_timeout_s : float
         Wall time for processes to come up, and to answer one event, s.
-    progress : callable
-        Told the simulated time, s.
     stopped : StopFlag
-        Ends the run early.
+        Ends start-up and runs early.
     """
 
-    scenario: Scenario
-    controller: str
     record_directory: Path
     bit_rate: int | None = None
     dbc: Path | None = None
     interface: str | None = None
     channel: str | None = None
     rt_ratio: Fraction = Fraction(1)
+    started: frozenset[str] = SIDES
     start_timeout_s: float = 120.0
     answer_timeout_s: float = 10.0
-    progress: Callable[[float], None] = lambda simulated_s: None
     stopped: StopFlag = field(default_factory=StopFlag)
 
     @property
     def wire_bit_rate(self) -> int:
         """Bit/s of the wire; on an adapter that was not told one, an assumption."""
         return self.bit_rate or DEFAULT_BIT_RATE
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions(RigOptions):
+    """One scenario on a rig of its own.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        What is played.
+    controller : str
+        Control law, one of `hil.scenario.CONTROLLERS`.
+    progress : callable
+        Told the simulated time, s.
+    """
+
+    scenario: Scenario
+    controller: str
+    progress: Callable[[float], None] = lambda simulated_s: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +99,7 @@ class Recording:
     traffic : ndarray of uint64, shape (frames, 4)
         Bus time of each frame's end (ns), id, dlc, data.
     supervisor, plant, controller : dict of ndarray, or None
-        The nodes' records; None if the process did not live to write it.
+        The nodes' records; None if the process did not live to write it, or is not ours.
     start_ns : int
         Bus time of the scenario's first period.
     simulated_s, wall_s, startup_s : float

@@ -38,7 +38,7 @@ class Played:
 @cache
 def played(scenario: str, controller: str = "adrc", bit_rate: int = 1_000_000) -> Played:
     """Play a built-in scenario in full, in this process, once for all tests."""
-    options = RunOptions(load_scenario(scenario), controller, Path(), bit_rate=bit_rate)
+    options = RunOptions(load_scenario(scenario), controller, record_directory=Path(), bit_rate=bit_rate)
     recording = run_inprocess(options)
     contract = Contract.load()
     trace = trace_of(recording, options.scenario, contract)

@@ -26,7 +26,7 @@ SINE_LOAD = short_scenario(1.0, load=((0.4, -2000.0), (0.7, 500.0)))
 
 
 def options(directory: Path, scenario: Scenario = SINE, **given) -> RunOptions:
-    return RunOptions(scenario, "adrc", directory, **given)
+    return RunOptions(scenario, "adrc", record_directory=directory, **given)
 
 
 @pytest.fixture(scope="module")

@@ -195,7 +195,7 @@ def test_the_bench_hands_the_bit_rate_to_both_sides(tmp_path, monkeypatch, bit_r
     spy.write_text(f'#!{sys.executable}\nimport sys\nprint(" ".join(sys.argv), file=sys.stderr)\n')
     spy.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(spy))
-    options = RunOptions(load_scenario("sine"), "adrc", tmp_path)
+    options = RunOptions(load_scenario("sine"), "adrc", record_directory=tmp_path)
     with NodeProcesses(options, bus_settings("pcan", "PCAN_USBBUS1", bit_rate)) as processes:
         processes.wait()
         for name in ("plant", "controller"):

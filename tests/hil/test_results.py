@@ -151,7 +151,7 @@ def test_the_error_starts_with_the_first_period_of_the_reference(trace):
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
 def test_the_log_reads_back_frame_by_frame(tmp_path, suffix):
-    recording = run_inprocess(RunOptions(short_scenario(0.3), "adrc", tmp_path))
+    recording = run_inprocess(RunOptions(short_scenario(0.3), "adrc", record_directory=tmp_path))
     path = tmp_path / f"bus{suffix}"
     write_bus_log(path, recording.traffic)
     with can.LogReader(path) as reader:

@@ -497,7 +497,7 @@ def test_limits_that_are_missed_are_an_exit_code_and_one_line(tmp_path, capsys):
 def judged(recording=None, **changes) -> tuple[bool | None, str]:
     """Judge the sine, or another recording, by other limits."""
     run = played("sine")
-    options = RunOptions(replace(load_scenario("sine"), **changes), "adrc", Path())
+    options = RunOptions(replace(load_scenario("sine"), **changes), "adrc", record_directory=Path())
     result = result_of(recording or run.recording, run.trace, CONTRACT, options, "inprocess")
     return result["within_limits"], result["verdict"]
 

@@ -47,7 +47,7 @@ def _replay(calibration, state, io, setpoints, positions):
 def bus_run(run: Callable[[RunOptions], object], scenario: Scenario) -> float:
     """Return multiples of real time of one run over the bus."""
     with tempfile.TemporaryDirectory() as directory:
-        recording = run(RunOptions(scenario, "adrc", Path(directory)))
+        recording = run(RunOptions(scenario, "adrc", record_directory=Path(directory)))
     return recording.simulated_s / recording.wall_s
 
 

@@ -32,7 +32,7 @@ def table(picture: Path | None = None) -> str:
         scenario = load_scenario(name)
         for controller in CONTROLLERS:
             with tempfile.TemporaryDirectory() as directory:
-                options = RunOptions(scenario, controller, Path(directory))
+                options = RunOptions(scenario, controller, record_directory=Path(directory))
                 recording = run_inprocess(options)
             trace = trace_of(recording, scenario, contract)
             result = result_of(recording, trace, contract, options, "inprocess")
