@@ -84,11 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
     run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .trc ...")
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
-    run.add_argument(
-        "-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; with -i the adapter's)"
-    )
+    run.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; -i: adapter's)")
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
-    run.add_argument("-i", "--interface", metavar="I", help="realtime: python-can interface (default: own)")
+    run.add_argument("-i", "--interface", metavar="I", help="realtime: interface (default: own bus)")
     run.add_argument("-c", "--channel", metavar="C", help="its channel; lockstep: for listeners")
     run.add_argument(
         "--rt-ratio", type=ratio, default="1", metavar="R", help="realtime: 0.1 is ten times slower"

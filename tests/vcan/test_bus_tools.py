@@ -252,7 +252,8 @@ def test_an_interface_that_is_removed_ends_both_with_one_line_and_their_whole_re
         set_link(CHANNEL, up=True)
     controller, plant = (load(sides[name].record, interruption) for name in ("controller", "plant"))
     down_periods = (interruption[1] - interruption[0]) // 1_000_000
-    assert len(controller["state"]) >= down_periods / 2, "inconclusive: the machine stalled"
+    for record in (controller, plant):
+        assert len(record["time_ns"]) >= down_periods / 2, "inconclusive: the machine stalled"
     assert (controller["state"][STALE_PERIODS + 1 :] == SAFE).all()
     assert (controller["target_velocity_0p25rpm"][STALE_PERIODS + 1 :] == 0).all()
     stopping = {DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT}
