@@ -319,6 +319,8 @@ class Hub:
             for _ in range(_FRAMES_PER_SERVICE - self.wire.waiting(port)):
                 packet = connection.recv(link.MAX_PACKET)
                 if not packet:
+                    if self.wire.waiting(port):
+                        return  # it has gone, but what it sent is still to go onto the wire
                     break
                 frame = link.unpack_frame(packet)
                 if self._virtual:
@@ -326,8 +328,8 @@ class Hub:
                 self.wire.send(port, self.wire.now_ns, frame)
             else:
                 return
-        except BlockingIOError:
-            return
+        except (BlockingIOError, ConnectionResetError):
+            return  # reset: it has gone without reading all; what it sent before is still to be taken
         except (OSError, ValueError):
             pass  # it has gone, or sends what is no frame: cut it off
         self._selector.unregister(connection)
