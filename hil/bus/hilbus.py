@@ -3,6 +3,8 @@
 import os
 import select
 import socket
+import time
+from contextlib import suppress
 from typing import Any
 
 import can
@@ -16,75 +18,133 @@ from hil.bus.messages import to_frame, to_message
 class HilBus(BusABC):
     """A participant of a running hub.
 
+    Frames are received until the hub ends; then the bus is shut down by itself.
+
+    Timestamps are bus time, which is 0 when the hub starts. Filters work in software; a thread sends periodic
+    messages. Frames wait in the kernel, never in this object: a readable `fileno` means that one is there,
+    and what was sent reaches the bus even if the sender leaves at once. Threads may share a bus.
+
     Parameters
     ----------
     channel : str or int
-        The hub's channel; python-can makes a number of one that consists of digits.
+        The hub's channel; python-can makes an int of a name that looks like one.
     can_filters : optional
-        As in python-can; filtering is done in software.
+        As in python-can.
+    bitrate : int, optional
+        The bit rate this program expects, bit/s. The hub has set it already: another one is refused, because
+        on a real bus such a participant hears nothing and disturbs everybody.
+    timing : can.BitTiming, optional
+        The same, as python-can's bit timing.
+    fd, receive_own_messages : bool
+        Not supported: refused if true.
     greeted : tuple, optional
         A link and the hub's answer from `hil.bus.link.connect`, to be used instead of a new one.
 
     Raises
     ------
     CanInitializationError
-        If there is no such hub, or it refuses.
+        If there is no such hub, or what is asked for is not what it offers.
     """
 
     def __init__(
         self,
-        channel: str | int,
+        channel: str | int | None = None,
         can_filters: Any = None,
+        bitrate: int | None = None,
+        timing: can.BitTiming | can.BitTimingFd | None = None,
+        fd: bool = False,
+        receive_own_messages: bool = False,
         greeted: tuple[socket.socket, dict[str, Any]] | None = None,
         **kwargs: Any,
     ) -> None:
-        channel = str(channel)
+        if channel is None:
+            raise CanInitializationError("hilbus needs a channel: the NAME of `hil bus --channel NAME`")
+        if fd or isinstance(timing, can.BitTimingFd):
+            raise CanInitializationError("hilbus carries classic CAN only: leave CAN FD out")
+        if receive_own_messages:
+            raise CanInitializationError(
+                "hilbus does not return a program's own messages: listen with a second bus on the channel"
+            )
+        self.channel = str(channel)
         try:
-            self._link, answer = greeted or link.connect(channel, {"role": "bus"})
+            self._link, answer = greeted or link.connect(self.channel, {"role": "bus"})
         except LinkError as error:
-            self._is_shutdown = True
-            raise CanInitializationError(str(error)) from error
+            raise CanInitializationError(str(error)) from None
         self.bit_rate: int = answer["bit_rate"]
-        self.channel = channel
-        self.channel_info = f"hilbus channel {channel!r}, {self.bit_rate} bit/s"
+        expected = timing.bitrate if timing else bitrate
+        if expected not in (None, self.bit_rate):
+            self._link.close()
+            raise CanInitializationError(
+                f"hilbus channel {self.channel!r} runs at {self.bit_rate} bit/s, not at {expected}: "
+                "leave the bit rate out or give the hub's"
+            )
+        self.channel_info = f"hilbus channel {self.channel!r}, {self.bit_rate} bit/s"
         self._can_protocol = CanProtocol.CAN_20
-        super().__init__(channel=channel, can_filters=can_filters, **kwargs)
+        self._left = ""
+        super().__init__(channel=self.channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: Message, timeout: float | None = None) -> None:
-        """Send a classic data frame; blocks while the hub is busy, at most `timeout` s if given."""
+        """Send a classic data frame; blocks while the hub is busy, at most `timeout` s if given.
+
+        Raises
+        ------
+        CanTimeoutError
+            If the hub took no frame in that time.
+        CanOperationError
+            If it is no classic data frame, or the bus is there no more.
+        """
+        until_s = time.monotonic() + (timeout or 0.0)
+        wait_ms = None if timeout is None else timeout * 1e3
+        room = select.poll()  # which, other than select, also returns when the link ends
         try:
             packet = link.pack_frame(to_frame(msg))
-            ready = timeout is None or select.select([], [self._link], [], timeout)[1]
-            if ready:
-                self._link.send(packet)
+            room.register(self._link, select.POLLOUT)
+            while room.poll(wait_ms):
+                with suppress(BlockingIOError):  # another thread took the place
+                    self._link.send(packet, socket.MSG_DONTWAIT)
+                    return
+                wait_ms = None if timeout is None else max(until_s - time.monotonic(), 0.0) * 1e3
         except (ValueError, OSError) as error:
-            raise CanOperationError(f"cannot send on {self.channel_info}: {error}") from error
-        if not ready:
-            raise can.CanTimeoutError(f"{self.channel_info} took no frame within {timeout} s")
+            raise self._failure("send", error) from None
+        raise can.CanTimeoutError(f"{self.channel_info} took no frame within {timeout} s")
 
     def _recv_internal(self, timeout: float | None) -> tuple[Message | None, bool]:
         try:
             if not select.select([self._link], [], [], timeout)[0]:
                 return None, False
             packet = self._link.recv(link.MAX_PACKET, socket.MSG_DONTWAIT)
-        except BlockingIOError:
+            if not packet:
+                self._leave(
+                    "the hub has ended"
+                )  # an open link would stay readable, and wake asyncio for ever
+                raise ConnectionError
+        except (BlockingIOError, ConnectionResetError):
+            # Another thread was faster; or the hub has ended, and what it sent before is still to be read.
             return None, False
         except (ValueError, OSError) as error:
-            raise CanOperationError(f"cannot receive on {self.channel_info}: {error}") from error
-        if not packet:
-            raise CanOperationError(f"the hub of {self.channel_info} has ended")
+            raise self._failure("receive", error) from None
         time_ns, frame = link.unpack_timed(packet)
         return to_message(time_ns, frame, self.channel), False
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when a frame is there."""
+        """Return the descriptor that becomes readable when a frame is there; -1 when the bus is not."""
         return self._link.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus; may be called again."""
+        """Leave the bus; wakes threads that wait in `recv` or `send`. May be called again."""
+        self._leave("the bus was shut down")
+
+    def _leave(self, reason: str) -> None:
         if not self._is_shutdown:
+            self._left = reason
             super().shutdown()
+            with suppress(OSError):  # the hub may have ended before
+                self._link.shutdown(socket.SHUT_RDWR)
             self._link.close()
+
+    def _failure(self, what: str, error: Exception) -> CanOperationError:
+        ended = "the hub has ended" if isinstance(error, ConnectionError) else error
+        return CanOperationError(f"cannot {what} on {self.channel_info}: {self._left or ended}")
 
     @staticmethod
     def _detect_available_configs() -> list[Any]:
@@ -95,6 +155,7 @@ class HilBus(BusABC):
             return []
         for path in sockets:
             probe = link.seqpacket_socket()
+            probe.setblocking(False)
             try:
                 probe.connect(os.fspath(path))
             except OSError:

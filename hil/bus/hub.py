@@ -364,13 +364,12 @@ class Hub:
                 self._held.add(fd)
                 self._selector.unregister(connection)
                 return
-        except BlockingIOError:
-            return
+        except (BlockingIOError, ConnectionResetError):
+            return  # reset: it has gone without reading all; what it sent before is still to be taken
         except (OSError, ValueError):
             pass  # it has gone, or sends what is no frame: cut it off
         self._selector.unregister(connection)
         self._dropped_by_gone += participant.dropped
-        wire.withdraw(participant.sender)
         del self._participants[fd]
         connection.close()
 

@@ -25,9 +25,17 @@ def to_frame(message: Message) -> Frame:
     Raises
     ------
     ValueError
-        For a remote, error or CAN FD frame.
+        For a remote, error or CAN FD frame, and for an id, dlc or data that no classic frame can have.
     """
     if message.is_fd or message.is_remote_frame or message.is_error_frame:
         raise ValueError("only classic data frames are carried")
-    can_id = message.arbitration_id | (EFF_FLAG if message.is_extended_id else 0)
-    return Frame(can_id, message.dlc, int.from_bytes(message.data, "little"))
+    can_id, highest_id = message.arbitration_id, 0x1FFF_FFFF if message.is_extended_id else 0x7FF
+    if not (0 <= can_id <= highest_id and len(message.data) <= message.dlc <= 8):
+        raise ValueError(
+            f"id {can_id:#x} with {len(message.data)} bytes, dlc {message.dlc}: no classic frame"
+        )
+    return Frame(
+        can_id | (EFF_FLAG if message.is_extended_id else 0),
+        message.dlc,
+        int.from_bytes(message.data, "little"),
+    )

@@ -22,20 +22,18 @@ class Session(Protocol):
         Steers the run.
     ending : str
         What ended it early; empty while all is well.
-    wire : Wire or None
-        The bus; None in real time.
-    ports : dict of str to Port
-        The nodes' places on the wire; empty in real time.
     """
 
     supervisor: Supervisor
     ending: str
 
     @property
-    def wire(self) -> Wire | None: ...
+    def wire(self) -> Wire | None:
+        """The bus; None in real time."""
 
     @property
-    def ports(self) -> Mapping[str, Port]: ...
+    def ports(self) -> Mapping[str, Port]:
+        """The nodes' places on the wire; empty in real time."""
 
     def run_to(self, period: int) -> None:
         """Go on to the start of a period, counted from power-on, or until something ends the run."""
