@@ -18,7 +18,8 @@ class Signal:
     """One signal of the contract, for tools that work in physical units.
 
     The physical value is ``raw * factor + offset`` in `unit`; `minimum` and `maximum` are physical,
-    None if the file sets no range.
+    None if the file sets no range. `page` is the value of the multiplexer, in the first byte, that selects
+    the signal; None for one that is always there.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Signal:
     minimum: float | None
     maximum: float | None
     choices: Mapping[int, str]
+    page: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -205,4 +205,5 @@ def _physical(signal: "DbcSignal") -> Signal:
         minimum=signal.minimum,
         maximum=signal.maximum,
         choices={raw: str(choice) for raw, choice in (signal.choices or {}).items()},
+        page=signal.multiplexer_ids[0] if signal.multiplexer_ids else None,
     )

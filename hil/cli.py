@@ -23,9 +23,9 @@ from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import Wire
 from hil.measure import result_of, trace_of
 from hil.report import OutputDirectory
+from hil.run.arguments import ratio
 from hil.run.inprocess import run_inprocess
 from hil.run.lockstep import run_lockstep
-from hil.run.node_process import ratio
 from hil.run.options import (
     DEFAULT_BIT_RATE,
     HUB_GREETING,
@@ -166,7 +166,7 @@ def _run(arguments: argparse.Namespace) -> int:
             )
             recording = MODES[arguments.mode](options)
         contract = Contract.load(arguments.dbc)
-        trace = trace_of(recording, scenario, contract)
+        trace = trace_of(recording, contract)
         result = result_of(recording, trace, contract, options, arguments.mode)
         files = folder.write(result, trace, recording.traffic)
     if arguments.json:

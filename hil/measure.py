@@ -13,7 +13,8 @@ from firmware_py.state_machine import State
 from firmware_py.task import Fault
 from hil.bus.wire_time import classic_bits
 from hil.run.options import Recording, RunOptions
-from hil.scenario import PERIOD_S, Scenario, TimingLimits
+from hil.scenario import PERIOD_S, TimingLimits
+from hil.signals import Series, signal_of
 from hil.timing import Timing, timing_of
 
 M_TO_MM = 1e3
@@ -46,86 +47,113 @@ OBSERVER_COLUMNS = (  # trace column, record column, signal of ObserverState tha
     ("eso_disturbance_m_s3", "z4", "EsoDisturbance"),
 )
 
+BUS_COLUMNS = {  # of a side without a record: trace column, signal
+    "plant": (
+        ("position_m", "PositionFeedback.Position"),
+        ("motor_speed_rpm", "DriveStatus.ActualVelocity"),
+    ),
+    "controller": (
+        ("position_measured_m", "PositionFeedback.Position"),
+        ("target_velocity_rpm", "DriveCommand.TargetVelocity"),
+    ),
+}
+
 Trace = dict[str, np.ndarray]
 
 
-def trace_of(recording: Recording, scenario: Scenario, contract: Contract) -> Trace:
-    """Merge the nodes' records by control period.
+def trace_of(recording: Recording, contract: Contract) -> Trace:
+    """Merge the nodes' records by control period; without a side's record, what the bus shows of it.
 
     Returns
     -------
     trace : dict of ndarray
-        One row per control period k = 0, 1, ... of the scenario that was played; NaN where a node has no row.
+        One row per control period k = 0, 1, ... of the scenario that was played; NaN where there is none.
     """
-    played = round(recording.simulated_s / PERIOD_S) - _first_period(recording)
-    rows = max(min(played, scenario.periods), 0)
-    trace = {"time_s": np.arange(rows) * PERIOD_S, "reference_m": scenario.reference_m()[:rows]}
+    rows = max(round(recording.simulated_s / PERIOD_S) - _first_period(recording), 0)
     signals = contract.observer_state.signals
     observer = tuple((name, source, signals[signal].factor) for name, source, signal in OBSERVER_COLUMNS)
+    trace = {"time_s": np.arange(rows) * PERIOD_S}
     sources = (
+        (recording.supervisor, (("reference_m", "reference_m", 1.0),), 0),
         (recording.plant, PLANT_COLUMNS, 0),
         (recording.controller, CONTROLLER_COLUMNS + observer, PHASE_NS),
     )
     for record, columns, phase_ns in sources:
-        if record is None:
-            continue
-        period = ((record["time_ns"] + phase_ns - recording.start_ns) // PERIOD_NS).astype(int)
-        inside = (period >= 0) & (period < rows)
-        for name, source, factor in columns:
-            trace[name] = np.full(rows, np.nan)
-            trace[name][period[inside]] = record[source][inside] * factor
-    if "position_m" in trace:
-        trace["error_m"] = trace["reference_m"] - trace["position_m"]
+        if record is not None:
+            period = ((record["time_ns"] + phase_ns - recording.start_ns) // PERIOD_NS).astype(int)
+            for name, source, factor in columns:
+                trace[name] = _by_period(rows, period, record[source] * factor)
+    for side, shown in BUS_COLUMNS.items():
+        if getattr(recording, side) is None:
+            for name, signal in shown:
+                series = signal_of(recording.traffic, contract, signal, recording.start_ns)
+                period = np.floor(series.time_s / PERIOD_S).astype(int)
+                trace[name] = _by_period(rows, period, series.values)
+    trace["error_m"] = trace["reference_m"] - trace["position_m"]
     return trace
 
 
-def result_of(
-    recording: Recording, trace: Trace, contract: Contract, options: RunOptions, mode: str
-) -> dict[str, Any]:
-    """Return the figures of a run, as written to ``result.json``.
+def _by_period(rows: int, period: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values laid out by period; NaN where there is none."""
+    column = np.full(rows, np.nan)
+    inside = (period >= 0) & (period < rows)
+    column[period[inside]] = values[inside]
+    return column
 
-    RMS and maximum are over e(t_k) = r(t_k) - x(t_k), x being the plant's unquantised position.
+
+def figures_of(
+    recording: Recording, trace: Trace, contract: Contract, bit_rate: int, mode: str
+) -> dict[str, Any]:
+    """Return what was measured in a run.
+
+    RMS and maximum are over e(t_k) = r(t_k) - x(t_k), x being the plant's unquantised position, or, where
+    the plant left no record, the measured one on the bus.
     """
-    scenario = options.scenario
-    error_mm = trace.get("error_m", np.full(1, np.nan)) * M_TO_MM
-    speed_steps_rpm = np.diff(trace.get("target_velocity_rpm", np.full(1, np.nan)))
-    speed_steps_rpm = speed_steps_rpm[np.isfinite(speed_steps_rpm)]
-    rms_mm = _finite(np.sqrt(np.nanmean(error_mm**2))) if np.isfinite(error_mm).any() else None
-    max_mm = _finite(np.nanmax(np.abs(error_mm))) if np.isfinite(error_mm).any() else None
-    limits = scenario.limits.get(options.controller)
-    timing = timing_in(recording, trace, contract, options.wire_bit_rate, mode)
-    complete = not recording.ending
-    within, verdict = None, ""
-    if complete:
-        tracking = _tracking_within(limits, rms_mm, max_mm)
-        within, verdict = _judged(trace, limits, tracking, timing, scenario.timing)
+    error_mm = Series(trace["time_s"], trace["error_m"] * M_TO_MM)
+    speed_steps_rpm = np.diff(trace["target_velocity_rpm"])
     return {
-        "scenario": scenario.name,
-        "controller": options.controller,
         "mode": mode,
-        "complete": complete,
+        "complete": not recording.ending,
         "ending": recording.ending,
-        "rms_mm": rms_mm,
-        "max_mm": max_mm,
-        "chatter_rpm_per_period": float(np.sqrt(np.mean(speed_steps_rpm**2)))
-        if speed_steps_rpm.size
-        else None,
-        "limits": limits,
-        "within_limits": within,
-        "verdict": verdict,
-        "paper": scenario.paper.get(options.controller),
-        "bit_rate": options.wire_bit_rate,
-        "bus_load_percent": bus_load_percent(recording, contract, options.wire_bit_rate),
-        "timing": timing.summary(),
-        "timing_limits": scenario.timing.given() or None,
+        "position": "plant" if recording.plant is not None else "bus",
+        "rms_mm": _finite(error_mm.rms),
+        "max_mm": _finite(error_mm.max),
+        "chatter_rpm_per_period": _finite(Series(trace["time_s"][1:], speed_steps_rpm).rms),
+        "bit_rate": bit_rate,
+        "bus_load_percent": bus_load_percent(recording, contract, bit_rate),
+        "timing": timing_in(recording, trace, contract, bit_rate, mode).summary(),
         "bus_frames": len(recording.traffic),
         "bus_sha256": hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest(),
         "scenario_start_bus_s": recording.start_ns / 1e9,
         "simulated_s": recording.simulated_s,
         "wall_s": recording.wall_s,
         "startup_s": recording.startup_s,
-        "realtime_factor": recording.simulated_s / recording.wall_s,
+        "realtime_factor": recording.simulated_s / recording.wall_s if recording.wall_s else 0.0,
         "notes": recording.notes,
+    }
+
+
+def result_of(
+    recording: Recording, trace: Trace, contract: Contract, options: RunOptions, mode: str
+) -> dict[str, Any]:
+    """Return a scenario's figures and the verdict on them, as written to ``result.json``."""
+    scenario, bit_rate = options.scenario, options.wire_bit_rate
+    figures = figures_of(recording, trace, contract, bit_rate, mode)
+    limits = scenario.limits.get(options.controller)
+    within, verdict = None, ""
+    if not recording.ending:
+        timing = timing_in(recording, trace, contract, bit_rate, mode)
+        tracking = _tracking_within(limits, figures["rms_mm"], figures["max_mm"])
+        within, verdict = _judged(trace, limits, tracking, timing, scenario.timing)
+    return {
+        "scenario": scenario.name,
+        "controller": options.controller,
+        **figures,
+        "limits": limits,
+        "timing_limits": scenario.timing.given() or None,
+        "within_limits": within,
+        "verdict": verdict,
+        "paper": scenario.paper.get(options.controller),
     }
 
 

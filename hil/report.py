@@ -113,7 +113,9 @@ def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
     beside = f"   (paper: {paper['rms_mm']:.3f} / {paper['max_mm']:.3f} mm)" if paper else ""
     bit_rate = f"{result['bit_rate'] / 1e3:g} kbit/s"
     title = f"{result['scenario']}, {result['controller'].upper()}, int32 over CAN at {bit_rate}"
-    figure.suptitle(f"{title}\nRMS {result['rms_mm']:.3f} mm, maximum {result['max_mm']:.3f} mm{beside}")
+    if result["max_mm"] is not None:
+        title += f"\nRMS {result['rms_mm']:.3f} mm, maximum {result['max_mm']:.3f} mm{beside}"
+    figure.suptitle(title)
 
     position.plot(time_s, trace["reference_m"] * M_TO_MM, color=GREY, lw=3, label="reference")
     position.plot(time_s, trace["position_m"] * M_TO_MM, color=BLUE, lw=1.2, label="position")

@@ -79,6 +79,11 @@ class Scenario:
         """Number of control periods."""
         return round(self.duration_s / PERIOD_S)
 
+    @property
+    def initial_m(self) -> float:
+        """Where the reference begins, m."""
+        return float(self.position_m(np.zeros(1))[0])
+
     def reference_m(self) -> np.ndarray:
         """Return the reference at the start of each period, m."""
         return self.position_m(np.arange(self.periods) * PERIOD_S)

@@ -12,7 +12,7 @@ from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from hil.references import setpoint_counts
-from hil.scenario import CONTROLLERS, PERIOD_S
+from hil.scenario import CONTROLLERS, PERIOD_S, Scenario
 
 BRING_UP_PERIODS = 100
 """Periods from the supervisor's start to the first one of a scenario: the drive is enabled in them."""
@@ -95,6 +95,12 @@ class Supervisor:
             `enable`, `fault_reset`, `load_n` (int) or `reference` (`Reference`).
         """
         heappush(self._plan, (period, next(self._planned), words))
+
+    def plan_scenario(self, scenario: Scenario) -> None:
+        """Plan a scenario's reference and loads, from the end of the bring-up on."""
+        self.plan(BRING_UP_PERIODS, reference=scenario.position_m)
+        for time_s, force_n in scenario.load:
+            self.plan(BRING_UP_PERIODS + round(time_s * 1e9) // PERIOD_NS, load_n=round(force_n))
 
     def steer(self, **words: int | Reference) -> None:
         """Change something with the next period; see `plan`."""

@@ -35,7 +35,7 @@ Evidence = tuple[tuple[Callable[[int], str], np.ndarray], ...]
 """Frames and instants behind the rows of a figure: what names one by its index, and each row's index."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Figure:
     """One figure of every control period.
 
@@ -52,6 +52,9 @@ class Figure:
     values: np.ndarray
     period: np.ndarray
     evidence: Evidence
+
+    def __repr__(self) -> str:
+        return f"<{len(self.values)} periods: p50 {self.p50:.1f}, p99 {self.p99:.1f}, max {self.max:.1f} µs>"
 
     @property
     def p50(self) -> float:

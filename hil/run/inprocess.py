@@ -36,9 +36,11 @@ class InprocessRig:
     """All nodes in this process; every session has new ones."""
 
     mode = "inprocess"
+    broken = False
 
     def __init__(self, options: RigOptions) -> None:
         self.contract = Contract.load(options.dbc)
+        self.bit_rate = options.wire_bit_rate
         self._options = options
         self._begin_s = time.perf_counter()
 
@@ -48,7 +50,7 @@ class InprocessRig:
     def __exit__(self, *_: object) -> None:
         self.finish()
 
-    def begin(self, controller: str, position_m: float) -> "VirtualSession":
+    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "VirtualSession":
         """Begin a run; see `hil.run.rig.Rig`."""
         plant = Plant(self.contract, PlantParameters())
         firmware = Controller(self.contract, Tuning().calibration().to_bytes())
@@ -58,7 +60,7 @@ class InprocessRig:
 
         return VirtualSession(
             self._options,
-            make_wire(self.contract, self._options.wire_bit_rate),
+            make_wire(self.contract, bit_rate or self.bit_rate),
             Supervisor(self.contract, controller, position_m),
             [plant, firmware],
             records,

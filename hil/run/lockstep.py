@@ -51,6 +51,8 @@ class LockstepRig:
 
     def __init__(self, options: RigOptions) -> None:
         self.contract = Contract.load(options.dbc)
+        self.bit_rate = options.wire_bit_rate
+        self.broken = False
         self._options = options
         self._begin_s = time.perf_counter()
         self._stack = ExitStack()
@@ -59,7 +61,7 @@ class LockstepRig:
     def __enter__(self) -> Self:
         options = self._options
         channel = options.channel or f"run-{os.getpid()}"
-        bit_rate = options.wire_bit_rate
+        bit_rate = self.bit_rate
         with ExitStack() as stack:
             self.hub = stack.enter_context(
                 Hub(make_wire(self.contract, bit_rate), channel, SIDES, options.answer_timeout_s)
@@ -76,9 +78,9 @@ class LockstepRig:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def begin(self, controller: str, position_m: float) -> "LockstepSession":
+    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "LockstepSession":
         """Begin a run; see `hil.run.rig.Rig`."""
-        wire = make_wire(self.contract, self._options.wire_bit_rate)
+        wire = make_wire(self.contract, bit_rate or self.bit_rate)
         self.hub.lead_to(wire)
         for name in SIDES:
             forget_record(self._options, name)
@@ -137,7 +139,7 @@ class LockstepSession(VirtualSession):
 
     def _lose(self, gone: NodeGoneError) -> None:
         """Let the others go on for a while, so that their reaction is on record, and say what happened."""
-        self.broken = True
+        self.broken = self._rig.broken = True
         gone_ns = self.wire.now_ns
         at = f"{gone} at bus time {gone_ns / 1e9:.3f} s"
         processes = self._rig.processes

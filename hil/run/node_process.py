@@ -20,6 +20,7 @@ from hil.bus.hilbus import HilBus
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings, open_bus
 from hil.bus.wire import Clock
+from hil.run.arguments import ratio
 from hil.run.realtime import DuplicateNodeError, RealtimeNode
 from hil.run.stopping import StopFlag, orphaned
 
@@ -47,23 +48,6 @@ def add_node_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", type=Path, metavar="DIR", help="write NAME.npz there at the end")
     parser.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
-
-
-def ratio(text: str) -> Fraction:
-    """Return a real-time ratio given as a decimal or a fraction.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        If it is not above 0 and at most 1.
-    """
-    try:
-        value = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        value = Fraction(0)
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0 and at most 1")
-    return value
 
 
 def node_main(

@@ -71,6 +71,7 @@ class RealtimeRig:
     def __init__(self, options: RigOptions) -> None:
         self.contract = Contract.load(options.dbc)
         self.options = options
+        self.bit_rate = options.wire_bit_rate
         self.begin_s = time.perf_counter()
         self.heard: list[tuple[int, can.Message]] = []
         self._session: RealtimeSession | None = None
@@ -96,8 +97,15 @@ class RealtimeRig:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def begin(self, controller: str, position_m: float) -> "RealtimeSession":
+    @property
+    def broken(self) -> bool:
+        """Whether a process was lost."""
+        return self._session is not None and self._session.broken
+
+    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "RealtimeSession":
         """Begin a run; see `hil.run.rig.Rig`."""
+        if bit_rate not in (None, self.bit_rate):
+            raise BenchError(f"this bus runs at {self.bit_rate} bit/s: the test needs virtual time")
         self._end_session()
         self.heard.clear()
         self._session = RealtimeSession(self, Supervisor(self.contract, controller, position_m))

@@ -1,6 +1,6 @@
 """What a bench consists of in every mode: a rig that stays, and one session on it after another."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol, Self
 
@@ -63,8 +63,22 @@ class Rig(Protocol):
 
     def __exit__(self, *_: object) -> None: ...
 
-    def begin(self, controller: str, position_m: float) -> Session:
-        """Reset all nodes and begin a run with the machine at rest at `position_m`."""
+    @property
+    def bit_rate(self) -> int:
+        """Bit/s."""
+
+    @property
+    def broken(self) -> bool:
+        """Whether a process was lost, so that no further session can begin."""
+
+    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> Session:
+        """Reset all nodes and begin a run with the machine at rest at `position_m`.
+
+        Raises
+        ------
+        BenchError
+            If the bus has another bit rate than is asked for.
+        """
 
     def finish(self) -> str:
         """End the node processes that were started; return what went wrong with them, or nothing."""
@@ -73,10 +87,8 @@ class Rig(Protocol):
 def play(rig: Rig, options: RunOptions) -> Recording:
     """Play a scenario on a rig that is not used afterwards."""
     scenario = options.scenario
-    session = rig.begin(options.controller, float(scenario.reference_m()[0]))
-    session.supervisor.plan(BRING_UP_PERIODS, reference=scenario.position_m)
-    for time_s, force_n in scenario.load:
-        session.supervisor.plan(BRING_UP_PERIODS + round(time_s / PERIOD_S), load_n=round(force_n))
+    session = rig.begin(options.controller, scenario.initial_m)
+    session.supervisor.plan_scenario(scenario)
     end = BRING_UP_PERIODS + scenario.periods
     for period in (*range(PROGRESS_PERIODS, end, PROGRESS_PERIODS), end):
         session.run_to(period)
@@ -88,3 +100,36 @@ def play(rig: Rig, options: RunOptions) -> Recording:
     if failure and not recording.ending:
         return replace(recording, ending=failure, broken=True)
     return recording
+
+
+class RigKeeper:
+    """Keeps a rig open for as long as its context lasts, and replaces one that is broken.
+
+    Parameters
+    ----------
+    new_rig : callable
+        Returns a rig that has not been entered.
+    """
+
+    def __init__(self, new_rig: Callable[[], Rig]) -> None:
+        self._new_rig = new_rig
+        self._open: Rig | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def rig(self) -> Rig:
+        """Return an open rig that can begin a session."""
+        if self._open is not None and self._open.broken:
+            self._close()
+        if self._open is None:
+            self._open = self._new_rig().__enter__()
+        return self._open
+
+    def _close(self) -> None:
+        if self._open is not None:
+            self._open.__exit__(None, None, None)
+            self._open = None

@@ -41,7 +41,7 @@ def played(scenario: str, controller: str = "adrc", bit_rate: int = 1_000_000) -
     options = RunOptions(load_scenario(scenario), controller, record_directory=Path(), bit_rate=bit_rate)
     recording = run_inprocess(options)
     contract = Contract.load()
-    trace = trace_of(recording, options.scenario, contract)
+    trace = trace_of(recording, contract)
     return Played(recording, trace, result_of(recording, trace, contract, options, "inprocess"))
 
 

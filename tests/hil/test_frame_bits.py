@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbc.frame import EFF_FLAG
-from hil.bus.wire_time import frame_bits
-from hil.bus.wire_time import RTR_FLAG, classic_bits, fd_bits
+from hil.bus.wire_time import RTR_FLAG, classic_bits, fd_bits, frame_bits
 
 STANDARD_IDS = st.integers(0, (1 << 11) - 1)
 EXTENDED_IDS = st.integers(0, (1 << 29) - 1)

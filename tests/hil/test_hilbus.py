@@ -112,7 +112,7 @@ def test_timestamps_are_the_bus_clock_s_and_a_burst_takes_its_time_on_the_wire(h
             sender.send(message())
         stamps_s = [m.timestamp for m in hear(one, 10)]
         assert [m.timestamp for m in hear(other, 10)] == stamps_s
-    assert [round(stamp_s * 1e9) for stamp_s in stamps_s] == list(hub.wire.traffic.cells[::4])
+    assert [round(stamp_s * 1e9) for stamp_s in stamps_s] == hub.wire.traffic[:, 0].tolist()
     shortest_s = frame_bits(message()) * 1e-6
     assert all(later - earlier >= shortest_s - 1e-9 for earlier, later in pairwise(stamps_s))
 

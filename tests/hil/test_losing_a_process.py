@@ -32,9 +32,11 @@ from firmware_py.tuning import Tuning
 from hil.bus import link
 from hil.bus.hub import Hub, NodeGoneError
 from hil.bus.wire import Clock, Wire
-from hil.run import lockstep
+from hil.bus.wire_core import NO_LINK
 from hil.run.inprocess import make_wire
-from hil.run.lockstep import AFTERMATH_NS
+from hil.run.lockstep import AFTERMATH_NS, LockstepSession
+from hil.run.options import RigOptions
+from hil.scenario import Scenario
 from hil.supervisor import BRING_UP_PERIODS, Supervisor
 from plant_sim.drive import State
 from plant_sim.node import Plant
@@ -50,13 +52,19 @@ LIMIT_RAD_S2 = PlantParameters().motor_acceleration_rad_s2
 # in virtual time
 
 
+def supervisor_of(scenario: Scenario) -> Supervisor:
+    supervisor = Supervisor(CONTRACT, "adrc", scenario.initial_m)
+    supervisor.plan_scenario(scenario)
+    return supervisor
+
+
 @pytest.mark.parametrize("lost_ms", [1600.0, 2500.1, 2500.55, 2500.65, 2500.75, 4000.9])
 def test_without_its_controller_the_motor_stops_in_time(lost_ms):
     """One frame that is under way, three periods from when it is latched, then the ramp.
 
     The motor follows the ramp with its lag of 5 ms.
     """
-    supervisor = Supervisor(CONTRACT, short_scenario(5.0), "adrc")
+    supervisor = supervisor_of(short_scenario(5.0))
     plant = Plant(CONTRACT, PlantParameters())
     controller = Controller(CONTRACT, Tuning().calibration().to_bytes())
     wire = make_wire(CONTRACT, 1_000_000)
@@ -87,7 +95,7 @@ def test_without_its_controller_the_motor_stops_in_time(lost_ms):
 
 
 def test_without_its_plant_the_controller_is_in_the_safe_state_within_three_periods():
-    supervisor = Supervisor(CONTRACT, short_scenario(1.0), "adrc")
+    supervisor = supervisor_of(short_scenario(1.0))
     controller = Controller(CONTRACT, Tuning().calibration().to_bytes())
     wire = make_wire(CONTRACT, 1_000_000)
     plant_port = wire.attach(Plant(CONTRACT, PlantParameters()))
@@ -107,26 +115,37 @@ def test_after_a_loss_the_others_play_on_for_a_tenth_of_a_second_of_bus_time():
     """A fixed amount of work, whatever the machine: what makes the end come soon."""
     assert AFTERMATH_NS == 100 * PERIOD_NS
 
-    class Dying:
-        name, accepts, latched, transmits = "controller", None, frozenset(), frozenset()
+    class LostRig:
+        options = RigOptions(record_directory=Path())
+        broken = False
 
-        def on_start(self, now_ns):
-            raise NodeGoneError(self.name, "ended")
+        class hub:
+            nodes = {"plant": Dying("plant"), "controller": Dying("controller")}
+            service = staticmethod(lambda: None)
 
-        on_timer = on_start
+        class processes:
+            exit_code = staticmethod(lambda name: " (exit code 9)")
 
-        def on_frame(self, now_ns, frame):
-            raise AssertionError("a lost node is not asked again")
+        records = staticmethod(lambda: {"plant": None, "controller": None})
 
-    supervisor = Supervisor(CONTRACT, short_scenario(1.0), "adrc")
-    wire = Wire(1_000_000)
-    ports = {"supervisor": wire.attach(supervisor), "controller": wire.attach(Dying())}
-    wire.start(ports["supervisor"])
-    with pytest.raises(NodeGoneError) as lost:
-        wire.start(ports["controller"])
-    lockstep._run_without(lost.value, wire, ports)
-    assert wire.now_ns == AFTERMATH_NS
-    assert len(wire.traffic) >= 100
+    session = LockstepSession(LostRig, Wire(1_000_000), supervisor_of(short_scenario(1.0)), 0.0)
+    assert session.ending == "the plant process ended at bus time 0.000 s (exit code 9)"
+    assert session.wire.now_ns == AFTERMATH_NS
+    assert len(session.wire.traffic) >= 100
+
+
+class Dying:
+    """A node that is lost at power-on."""
+
+    link, accepts, latched = NO_LINK, None, frozenset()
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def ask(self, packet, answer):
+        raise NodeGoneError(self.name, "ended")
+
+    late_answer = ask
 
 
 def test_a_hub_that_vanishes_ends_a_node_at_once_with_one_line():

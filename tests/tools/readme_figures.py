@@ -34,7 +34,7 @@ def table(picture: Path | None = None) -> str:
             with tempfile.TemporaryDirectory() as directory:
                 options = RunOptions(scenario, controller, record_directory=Path(directory))
                 recording = run_inprocess(options)
-            trace = trace_of(recording, scenario, contract)
+            trace = trace_of(recording, contract)
             result = result_of(recording, trace, contract, options, "inprocess")
             ours, paper = (f"{f['rms_mm']:.3f} / {f['max_mm']:.3f}" for f in (result, result["paper"]))
             lines.append(f"| {name} | {controller.upper()} | {ours} | {paper} |")

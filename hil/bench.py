@@ -1,0 +1,284 @@
+"""What a test holds in its hand: command, run, assert in units."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dbc.codec import MessageCodec
+from dbc.contract import Contract
+from firmware_py.state_machine import State as ControllerState
+from firmware_py.task import Fault
+from hil.bus.wire import FrameFault, Wire
+from hil.measure import M_TO_MM, Trace, figures_of, timing_in, trace_of
+from hil.report import OutputDirectory
+from hil.run.options import BenchError, Recording
+from hil.run.rig import Rig
+from hil.scenario import PERIOD_S, TimingLimits
+from hil.signals import Series, signal_of
+from hil.supervisor import BRING_UP_PERIODS, Reference
+from hil.timing import Figure, Timing
+
+RECOVERY_STEPS = ((0, {"enable": 0, "fault_reset": 0}), (3, {"fault_reset": 1}), (50, {"fault_reset": 0}))
+"""Periods from now and mode commands that bring a controller from its safe state back to standby."""
+
+
+class Bench:
+    """A run that is steered step by step.
+
+    It begins with the machine at rest, brought up and enabled: time 0 is the first period after that. What is
+    asked for takes effect when `run` goes on. In virtual time nothing passes between two runs; in real time
+    the setpoints keep coming, and `run` goes on to where it would be had no time been lost.
+
+    Parameters
+    ----------
+    rig : Rig
+        Bus and nodes; its sessions come one after another.
+    controller : str
+        Control law, one of `hil.scenario.CONTROLLERS`.
+    position_m : float
+        Where the machine starts.
+    bit_rate : int, optional
+        Bit/s, if not the rig's own; in virtual time only.
+
+    Raises
+    ------
+    BenchError
+        If a process was lost, or the bit rate cannot be had.
+    """
+
+    def __init__(
+        self, rig: Rig, controller: str = "adrc", position_m: float = 0.0, bit_rate: int | None = None
+    ) -> None:
+        self.mode = rig.mode
+        self.bit_rate = bit_rate or rig.bit_rate
+        self.controller = controller
+        self._contract = rig.contract
+        self._session = rig.begin(controller, position_m, bit_rate)
+        self._supervisor = self._session.supervisor
+        self._period = BRING_UP_PERIODS
+        self._recording: Recording | None = None
+        self._trace: Trace | None = None
+        self._go_on()
+
+    # commands
+
+    def setpoint(self, reference: float | Reference) -> None:
+        """Follow a reference from now on: a position in m, or a function of the time from now (s, array)."""
+        if callable(reference):
+            follow = reference
+        else:
+            position_m = float(reference)
+
+            def follow(time_s: np.ndarray) -> np.ndarray:
+                return np.full(len(time_s), position_m)
+
+        self._supervisor.plan(self._period, reference=follow)
+
+    def load_force(self, force_n: float) -> None:
+        """Let a force act on the rod, N; positive resists extension."""
+        self._supervisor.plan(self._period, load_n=round(force_n))
+
+    def enable(self) -> None:
+        """Ask for closed-loop control."""
+        self._supervisor.plan(self._period, enable=1)
+
+    def disable(self) -> None:
+        """Ask for standby."""
+        self._supervisor.plan(self._period, enable=0)
+
+    def recover(self) -> None:
+        """Ask to leave the safe state: withdraw the enable, reset the fault; takes 60 ms of `run`."""
+        for periods, words in RECOVERY_STEPS:
+            self._supervisor.plan(self._period + periods, **words)
+
+    def silence(self, *messages: str) -> None:
+        """Hold back messages of the supervisor, e.g. PositionSetpoint."""
+        self._supervisor.silent |= {self._codec(name).can_id for name in messages}
+
+    def unsilence(self, *messages: str) -> None:
+        """Send them again."""
+        self._supervisor.silent -= {self._codec(name).can_id for name in messages}
+
+    def run(self, duration_s: float) -> None:
+        """Go on.
+
+        Raises
+        ------
+        BenchError
+            If a process was lost.
+        """
+        self._period += round(duration_s / PERIOD_S)
+        self._go_on()
+
+    # what can go wrong, in virtual time
+
+    def drop(self, message: str, count: int = 1) -> None:
+        """Lose the next frames of a message."""
+        self._spoil(message, FrameFault.DROP, 0, count)
+
+    def corrupt(self, message: str, bit: int, count: int = 1) -> None:
+        """Flip a payload bit of the next frames of a message, behind CAN's own CRC."""
+        self._spoil(message, FrameFault.CORRUPT, 1 << bit, count)
+
+    def delay(self, message: str, delay_s: float, count: int = 1) -> None:
+        """Hand the next frames of a message over later; what follows may overtake them."""
+        self._spoil(message, FrameFault.DELAY, round(delay_s * 1e9), count)
+
+    def repeat(self, message: str, count: int = 1) -> None:
+        """Let the next frames of a message carry the payload of the last one, counter and CRC included."""
+        self._spoil(message, FrameFault.REPEAT, 0, count)
+
+    def power_off(self, node: str) -> None:
+        """Cut "plant" or "controller" off."""
+        self._wire("power_off").detach(self._session.ports[node])
+
+    def power_on(self, node: str) -> None:
+        """Start a node anew that was cut off, or reset one that was not."""
+        wire, port = self._wire("power_on"), self._session.ports[node]
+        wire.reconnect(port)
+        wire.start(port)
+
+    # what came of it
+
+    @property
+    def time_s(self) -> float:
+        """Time since the bench was ready, s."""
+        return (self._period - BRING_UP_PERIODS) * PERIOD_S
+
+    @property
+    def error_mm(self) -> Series:
+        """Reference less position: the plant's own, or in real time the measured one; mm."""
+        return self._column("error_m", M_TO_MM)
+
+    @property
+    def position_mm(self) -> Series:
+        """Position, as for `error_mm`; mm."""
+        return self._column("position_m", M_TO_MM)
+
+    @property
+    def motor_speed_rpm(self) -> Series:
+        """Motor speed; in real time as DriveStatus reports it."""
+        return self._column("motor_speed_rpm", 1.0)
+
+    @property
+    def feedback_age_us(self) -> Figure:
+        """See `hil.timing.Timing`."""
+        return self.timing.feedback_age_us
+
+    @property
+    def setpoint_age_us(self) -> Figure:
+        """See `hil.timing.Timing`."""
+        return self.timing.setpoint_age_us
+
+    @property
+    def latency_us(self) -> Figure:
+        """See `hil.timing.Timing`."""
+        return self.timing.latency_us
+
+    @property
+    def jitter_us(self) -> Figure:
+        """See `hil.timing.Timing`."""
+        return self.timing.jitter_us
+
+    @property
+    def timing(self) -> Timing:
+        """Timing of every control period since time 0."""
+        return timing_in(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
+
+    def check_timing(self, limits: TimingLimits) -> None:
+        """Make sure that every control period met its limits.
+
+        Raises
+        ------
+        AssertionError
+            Naming the periods that did not, and the frames involved.
+        """
+        broken = self.timing.violations(limits)
+        assert not broken, f"{len(broken)} timing violations:\n" + "\n".join(map(str, broken[:10]))
+
+    @property
+    def controller_state(self) -> ControllerState | None:
+        """State of the controller: now, or in real time as last reported (every 100 ms)."""
+        value = self._newest("controller_state", "ControllerStatus.State")
+        return None if np.isnan(value) else ControllerState(int(value))
+
+    @property
+    def controller_faults(self) -> set[str]:
+        """Names of the controller's fault signals that are set; as up to date as `controller_state`."""
+        if "controller_faults" in self.trace:
+            bits = self._newest("controller_faults", "")
+            faults = Fault(0 if np.isnan(bits) else int(bits))
+            names = [str(fault.name) for fault in Fault if fault in faults]
+            return {"".join(part.capitalize() for part in name.split("_")) for name in names}
+        signals = self._codec("ControllerStatus").signals
+        flags = [name for name, signal in signals.items() if signal.length == 1]
+        return {name for name in flags if self.signal(f"ControllerStatus.{name}").last == 1}
+
+    def signal(self, name: str) -> Series:
+        """Return ``Message.Signal`` from the bus, in its unit, over the time since time 0."""
+        recording = self.recording
+        return signal_of(recording.traffic, self._contract, name, recording.start_ns)
+
+    @property
+    def trace(self) -> Trace:
+        """One row per control period since time 0; see `hil.measure.trace_of`."""
+        if self._trace is None:
+            self._trace = trace_of(self.recording, self._contract)
+        return self._trace
+
+    @property
+    def recording(self) -> Recording:
+        """All there is so far."""
+        if self._recording is None:
+            self._recording = self._session.recording()
+        return self._recording
+
+    @property
+    def contract(self) -> Contract:
+        """The DBC."""
+        return self._contract
+
+    def result(self, name: str) -> dict[str, Any]:
+        """Return the figures so far, under the name of a test."""
+        figures = figures_of(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
+        return {"scenario": name, "controller": self.controller, **figures, "paper": None}
+
+    def write(self, folder: Path, name: str) -> list[Path]:
+        """Leave figures, trace, bus log and picture in a folder; return the files."""
+        with OutputDirectory(folder, ".log") as directory:
+            return directory.write(self.result(name), self.trace, self.recording.traffic)
+
+    def end(self) -> None:
+        """Leave the machine disabled; nothing runs afterwards."""
+        self._session.end()
+
+    def _go_on(self) -> None:
+        self._recording = self._trace = None
+        if not self._session.ending:
+            self._session.run_to(self._period)
+        if self._session.ending:
+            raise BenchError(self._session.ending)
+
+    def _column(self, name: str, factor: float) -> Series:
+        return Series(self.trace["time_s"], self.trace[name] * factor)
+
+    def _newest(self, column: str, signal: str) -> float:
+        if column in self.trace:
+            return Series(self.trace["time_s"], self.trace[column]).last
+        return self.signal(signal).last
+
+    def _spoil(self, message: str, fault: FrameFault, argument: int, count: int) -> None:
+        self._wire(fault.name.lower()).spoil(self._codec(message).can_id, fault, argument, count)
+
+    def _wire(self, what: str) -> Wire:
+        wire = self._session.wire
+        if wire is None:
+            raise BenchError(f"{what} needs virtual time: use --hil-mode inprocess or lockstep")
+        return wire
+
+    def _codec(self, name: str) -> MessageCodec[..., Any]:
+        for message in self._contract.messages:
+            if message.name == name:
+                return message
+        raise ValueError(f"there is no message {name!r}")

@@ -1,0 +1,256 @@
+"""The bench in pytest: fixtures, options, what a failing test leaves, and figures for JUnit XML.
+
+A test that takes the fixture `bench` gets a machine that is brought up and enabled::
+
+    def test_load_is_rejected(bench):
+        bench.setpoint(sine)
+        bench.run(3.0)
+        bench.load_force(-2000)
+        bench.run(2.0)
+        assert bench.error_mm.max < 1.45
+
+``@pytest.mark.bench(controller="pi", position_m=0.2, bit_rate=500_000)`` says how it begins, and
+``@pytest.mark.needs("wire_faults")`` what only some interfaces have: where they have not, the test is not
+applicable, and counted as such.
+"""
+
+import argparse
+import shlex
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from hil.bench import Bench
+    from hil.run.rig import Rig
+
+MODES = ("inprocess", "lockstep", "realtime")
+SIDES = {"none": frozenset[str](), "plant": {"plant"}, "controller": {"controller"}}
+
+_VIRTUAL = frozenset({"virtual_time", "wire_faults", "power"})
+CAPABILITIES = {  # what a test may need, by interface
+    "inprocess": _VIRTUAL,
+    "lockstep": _VIRTUAL,
+    "hilbus": frozenset({"wall_time"}),
+    "socketcan": frozenset({"wall_time", "real_bus"}),
+}
+_OTHER_ADAPTER = frozenset({"wall_time", "real_bus"})
+
+_not_applicable = pytest.StashKey[Counter[str]]()
+_applicable = pytest.StashKey[int]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the bench's options."""
+    group = parser.getgroup("hil", "bench of a controller on a CAN bus")
+    group.addoption("--hil-mode", choices=MODES, default="lockstep", help="default lockstep")
+    group.addoption(
+        "--hil-interface",
+        metavar="I",
+        help="realtime: python-can interface, with plant and firmware on it (default: own bus and processes)",
+    )
+    group.addoption("--hil-channel", metavar="C", help="its channel; lockstep: for listeners")
+    group.addoption(
+        "--hil-start",
+        choices=("both", *SIDES),
+        help="realtime: which side to start here (default none with --hil-interface, else both)",
+    )
+    group.addoption("--hil-start-timeout", type=float, default=120.0, metavar="S", help="default 120 s")
+    group.addoption("--rt-ratio", default="1", metavar="R", help="realtime: 0.1 is ten times slower")
+    group.addoption("--hil-bitrate", type=int, metavar="B", help="bit/s (default 1000000)")
+    group.addoption(
+        "--hil-out", type=Path, default=Path("out/pytest"), metavar="DIR", help="default out/pytest"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register markers, and refuse options that do not go together."""
+    config.addinivalue_line(
+        "markers", "bench(controller='adrc', position_m=0.0, bit_rate=None): how the bench begins"
+    )
+    config.addinivalue_line("markers", "needs(*what): not applicable where the interface lacks it")
+    if config.getoption("hil_interface") and config.getoption("hil_mode") != "realtime":
+        raise pytest.UsageError("--hil-interface needs --hil-mode realtime")
+    _ratio(config)
+
+
+def interface_of(config: pytest.Config) -> str:
+    """Return the interface that tests run on: "inprocess", "lockstep", or python-can's name in real time."""
+    mode: str = config.getoption("hil_mode")
+    return config.getoption("hil_interface") or "hilbus" if mode == "realtime" else mode
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect what needs what the interface lacks."""
+    has = CAPABILITIES.get(interface_of(config), _OTHER_ADAPTER)
+    lacking: Counter[str] = Counter()
+    out = []
+    for item in items:
+        needs = [need for marker in item.iter_markers("needs") for need in marker.args]
+        if unknown := [need for need in needs if not any(need in all_ for all_ in CAPABILITIES.values())]:
+            raise pytest.UsageError(f"{item.nodeid}: nothing has {unknown[0]!r}")
+        if missing := [need for need in needs if need not in has]:
+            lacking[missing[0]] += 1
+            out.append(item)
+    config.stash[_not_applicable] = lacking
+    config.hook.pytest_deselected(items=out)
+    items[:] = [item for item in items if item not in out]
+    config.stash[_applicable] = sum("bench" in getattr(item, "fixturenames", ()) for item in items)
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Say what was not applicable, and why."""
+    lacking, applicable = config.stash.get(_not_applicable, Counter()), config.stash.get(_applicable, 0)
+    if not lacking and not applicable:
+        return
+    passed = sum("bench" in dict(report.user_properties) for report in terminalreporter.getreports("passed"))
+    why = ", ".join(f"{count} need {what}" for what, count in sorted(lacking.items())) or "none"
+    terminalreporter.write_line(
+        f"hil: {applicable} scenarios on {interface_of(config)}, {passed} passed; "
+        f"{sum(lacking.values())} not applicable ({why})"
+    )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note the figures of the benches a test had; of a failing one leave the folder and say how to replay."""
+    benches: list[Bench] = getattr(item, "funcargs", {}).get("_benches", [])
+    results = [bench.result(item.name) for bench in benches] if call.when == "call" else []
+    for result in results:
+        item.user_properties.append(("bench", result["mode"]))
+        item.user_properties.extend(_properties(result))
+    report = yield
+    if call.when == "call" and report.failed and benches:
+        folders = [str(_leave(item, bench, number)) for number, bench in enumerate(benches)]
+        text = f"results in {', '.join(folders)}\nreplay: {_replay_command(item)}"
+        report.sections.append(("bench", text))
+    return report
+
+
+@pytest.fixture(scope="session")
+def hil_rig(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> "Iterator[Callable[[], Rig]]":
+    """Return what gives the rig of this test session; one that has lost a process is replaced."""
+    from hil.run.options import BenchError
+    from hil.run.rig import RigKeeper
+
+    try:
+        with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
+            yield keeper.rig
+    except BenchError as error:
+        pytest.exit(f"hil: {error}", returncode=2)
+
+
+@pytest.fixture
+def _benches() -> "list[Bench]":
+    """Return the benches of this test."""
+    return []
+
+
+@pytest.fixture
+def bench_at(hil_rig: "Callable[[], Rig]", _benches: "list[Bench]") -> "Iterator[Callable[..., Bench]]":
+    """Return what makes a bench: ``bench_at(controller="adrc", position_m=0.0, bit_rate=None)``."""
+    from hil.bench import Bench
+
+    def bench_at(**how: Any) -> "Bench":
+        for earlier in _benches:
+            earlier.end()
+        bench = Bench(hil_rig(), **how)
+        _benches.append(bench)
+        return bench
+
+    yield bench_at
+    for bench in _benches:
+        bench.end()
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, bench_at: "Callable[..., Bench]") -> "Bench":
+    """Return a bench that is brought up and enabled; the marker `bench` says how it begins."""
+    marker = request.node.get_closest_marker("bench")
+    return bench_at(**(marker.kwargs if marker else {}))
+
+
+def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
+    import can
+
+    from hil.bus.link import LinkError
+    from hil.bus.opening import bus_settings
+    from hil.run.inprocess import InprocessRig
+    from hil.run.lockstep import LockstepRig
+    from hil.run.options import SIDES as BOTH
+    from hil.run.options import BenchError, RigOptions
+    from hil.run.realtime_rig import RealtimeRig
+
+    interface, channel = config.getoption("hil_interface"), config.getoption("hil_channel")
+    bit_rate = config.getoption("hil_bitrate")
+    start = config.getoption("hil_start") or ("none" if interface else "both")
+    rigs: dict[str, Callable[[RigOptions], Rig]] = {
+        "inprocess": InprocessRig,
+        "lockstep": LockstepRig,
+        "realtime": RealtimeRig,
+    }
+    try:
+        if interface:
+            interface, channel, bit_rate = bus_settings(interface, channel, bit_rate)
+        options = RigOptions(
+            record_directory=directory,
+            bit_rate=bit_rate,
+            interface=interface,
+            channel=channel,
+            rt_ratio=_ratio(config),
+            started=frozenset(SIDES.get(start, BOTH)),
+            start_timeout_s=config.getoption("hil_start_timeout"),
+        )
+        return rigs[config.getoption("hil_mode")](options)
+    except (LinkError, can.CanInitializationError) as error:
+        raise BenchError(str(error)) from error
+
+
+def _ratio(config: pytest.Config) -> Fraction:
+    from hil.run.arguments import ratio
+
+    try:
+        return ratio(config.getoption("rt_ratio"))
+    except argparse.ArgumentTypeError as error:
+        raise pytest.UsageError(f"--rt-ratio: {error}") from error
+
+
+def _properties(result: dict[str, Any]) -> list[tuple[str, object]]:
+    """Return a run's figures as JUnit properties."""
+    timing = result["timing"]
+    figures = {key: result[key] for key in ("rms_mm", "max_mm", "bus_load_percent", "bus_sha256")}
+    for name, figure in timing.items():
+        figures |= (
+            {f"{name}_{key}": value for key, value in figure.items()}
+            if isinstance(figure, dict)
+            else {name: figure}
+        )
+    return list(figures.items())
+
+
+def _leave(item: pytest.Item, bench: "Bench", number: int) -> Path:
+    """Write a bench's folder and return it."""
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in item.name)
+    folder: Path = item.config.getoption("hil_out") / (f"{name}-{number + 1}" if number else name)
+    bench.write(folder, item.name)
+    return folder
+
+
+def _replay_command(item: pytest.Item) -> str:
+    """Return the command line that runs one test again as it ran."""
+    given = [argument for argument in item.config.invocation_params.args if str(argument).startswith("-")]
+    options = []
+    for option in ("hil-mode", "hil-interface", "hil-channel", "hil-start", "rt-ratio", "hil-bitrate"):
+        value = item.config.getoption(option.replace("-", "_"))
+        if value is not None and any(str(argument).startswith(f"--{option}") for argument in given):
+            options.append(f"--{option}={value}")
+    return shlex.join(["pytest", item.nodeid, *options])

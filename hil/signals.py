@@ -1,0 +1,102 @@
+"""Signals of a bus log by their names in the DBC."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dbc.contract import Contract
+
+_MULTIPLEXOR_BITS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Series:
+    """A quantity over time.
+
+    Attributes
+    ----------
+    time_s : ndarray of float
+        Times, s.
+    values : ndarray of float
+        Values at those times; NaN where unknown.
+    """
+
+    time_s: np.ndarray
+    values: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} values, last {self.last:.6g}, largest magnitude {self.max:.6g}>"
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square; NaN if nothing is known, which no comparison passes."""
+        known = self._known()
+        return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+    @property
+    def max(self) -> float:
+        """Largest magnitude; NaN if nothing is known."""
+        known = self._known()
+        return float(np.abs(known).max()) if known.size else float("nan")
+
+    @property
+    def last(self) -> float:
+        """Newest known value; NaN if nothing is known."""
+        known = self._known()
+        return float(known[-1]) if known.size else float("nan")
+
+    def between(self, begin_s: float, end_s: float = float("inf")) -> "Series":
+        """Return the part from `begin_s` until before `end_s`."""
+        inside = (self.time_s >= begin_s - 1e-9) & (self.time_s < end_s - 1e-9)
+        return Series(self.time_s[inside], self.values[inside])
+
+    def first(self, value: float) -> float:
+        """Return the time at which the quantity is `value` for the first time, s; NaN if it never is."""
+        when = self.time_s[self.values == value]
+        return float(when[0]) if when.size else float("nan")
+
+    def _known(self) -> np.ndarray:
+        return self.values[np.isfinite(self.values)]
+
+
+def signal_of(traffic: np.ndarray, contract: Contract, name: str, start_ns: int = 0) -> Series:
+    """Return a signal in physical units, at the ends of the frames that carried it.
+
+    Parameters
+    ----------
+    traffic : ndarray of uint64, shape (frames, 4)
+        As in `hil.run.options.Recording`.
+    contract : Contract
+        The DBC.
+    name : str
+        ``Message.Signal``, as in the DBC.
+    start_ns : int
+        Bus time from which the times count.
+
+    Raises
+    ------
+    ValueError
+        If there is no such message or signal.
+    """
+    message_name, _, signal_name = name.partition(".")
+    message = next((message for message in contract.messages if message.name == message_name), None)
+    if message is None:
+        known = ", ".join(message.name for message in contract.messages)
+        raise ValueError(f"there is no message {message_name!r}: choose one of {known}")
+    signal = message.signals.get(signal_name)
+    if signal is None:
+        raise ValueError(
+            f"{message_name} has no signal {signal_name!r}: choose one of {', '.join(message.signals)}"
+        )
+    rows = traffic[traffic[:, 1] == message.can_id]
+    if signal.page is not None:
+        rows = rows[rows[:, 3] & np.uint64((1 << _MULTIPLEXOR_BITS) - 1) == signal.page]
+    raw = (rows[:, 3] >> np.uint64(signal.start) & np.uint64((1 << signal.length) - 1)).astype(np.int64)
+    if signal.signed:
+        sign = 1 << signal.length - 1
+        raw = (raw ^ sign) - sign
+    time_s = (rows[:, 0].astype(np.int64) - start_ns) / 1e9
+    return Series(time_s, raw * signal.factor + signal.offset)
