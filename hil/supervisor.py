@@ -74,7 +74,7 @@ class Supervisor:
         self._protect_command = self._command.protector().protect
         self.transmits = frozenset({self._setpoint.can_id, self._command.can_id})
         self._origin_ns = 0
-        self._position_m = position_m
+        self._initial = position_m, int(setpoint_counts(np.array(position_m)))
         self._reference: Reference | None = None
         self._reference_begin = 0
         self._chunk: tuple[list[float], list[int]] = ([], [])
@@ -153,7 +153,7 @@ class Supervisor:
     def _position_in(self, period: int) -> tuple[float, int]:
         """Return the reference of a period, in m and in counts of the setpoint."""
         if self._reference is None:
-            return self._position_m, self._initial_raw()
+            return self._initial
         index = period - self._chunk_begin
         if index >= len(self._chunk[0]):
             self._chunk_begin, index = period, 0
@@ -162,9 +162,6 @@ class Supervisor:
             self._chunk = reference_m.tolist(), setpoint_counts(reference_m).tolist()
         return self._chunk[0][index], self._chunk[1][index]
 
-    def _initial_raw(self) -> int:
-        return int(setpoint_counts(np.array(self._position_m)))
-
     def _command_frame(self) -> Frame:
         message, words = self._command, self._words
         payload = message.pack(words["enable"], words["law"], words["fault_reset"])
@@ -172,4 +169,4 @@ class Supervisor:
 
     def _reset_frame(self) -> Frame:
         message = self._bench_control
-        return message.frame(message.pack(BenchCommand.RESET, 0, self._initial_raw()))
+        return message.frame(message.pack(BenchCommand.RESET, 0, self._initial[1]))

@@ -116,11 +116,7 @@ class Participant:
 
     def flush(self, log: np.ndarray) -> None:
         """Send what the program has room for of what others sent; drop the oldest of too much."""
-        excess = len(log) - self.position - QUEUE_FRAMES
-        if excess > 0:
-            lost = log[self.position : self.position + excess, LOG_SENDER]
-            self.dropped += int(np.count_nonzero(lost != self.sender))
-            self.position += excess
+        self._skip_to(log, len(log) - QUEUE_FRAMES)
         rows = log[self.position :]
         if not len(rows):
             return
@@ -136,6 +132,16 @@ class Participant:
             pass
         except OSError:  # it has gone: service() will see the end of the link
             self.position = len(log)
+
+    def give_up(self, log: np.ndarray) -> None:
+        """Drop all that the program has not taken."""
+        self._skip_to(log, len(log))
+
+    def _skip_to(self, log: np.ndarray, position: int) -> None:
+        if position > self.position:
+            lost = log[self.position : position, LOG_SENDER]
+            self.dropped += int(np.count_nonzero(lost != self.sender))
+            self.position = position
 
 
 class Hub:
@@ -202,6 +208,7 @@ class Hub:
         for node in self.nodes.values():
             node.stop()
         self._flush_to_the_end()
+        self._dropped_by_gone = self.dropped
         for _, connection in self._participants.values():
             connection.close()
         for connection in self._strangers.values():
@@ -264,7 +271,7 @@ class Hub:
             while participant.position < len(log) and time.monotonic() < deadline_s:
                 select.select([], [connection], [], _LAST_FLUSH_S)
                 participant.flush(log)
-            self._dropped_by_gone += len(log) - participant.position
+            participant.give_up(log)
 
     def _discard_what_all_have_read(self) -> None:
         log = self.wire.log
