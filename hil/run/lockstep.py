@@ -67,7 +67,7 @@ class LockstepRig:
                 Hub(make_wire(self.contract, bit_rate), channel, SIDES, options.answer_timeout_s)
             )
             self.processes = stack.enter_context(
-                NodeProcesses(options, BusSettings("hilbus", channel, bit_rate), SIDES)
+                NodeProcesses(options, BusSettings("hilbus", channel, bit_rate))
             )
             self._wait_for_nodes()
             for pid in self.processes.pids:

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,14 +25,12 @@ class NodeProcesses:
     Parameters
     ----------
     options : RigOptions
-        Real-time ratio, DBC and record directory are handed on.
+        Says which sides to start; real-time ratio, DBC and record directory are handed on.
     bus : BusSettings
         The bus they are to meet on.
-    names : collection of str
-        Which of `MODULES`.
     """
 
-    def __init__(self, options: RigOptions, bus: BusSettings, names: Collection[str]) -> None:
+    def __init__(self, options: RigOptions, bus: BusSettings) -> None:
         self._logs: dict[str, Path] = {}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         arguments = ["-i", bus.interface, "-c", bus.channel, "--rt-ratio", str(options.rt_ratio)]
@@ -42,7 +39,7 @@ class NodeProcesses:
             arguments += ["-b", str(bus.bit_rate)]
         if options.dbc is not None:
             arguments += ["--dbc", str(options.dbc)]
-        for name in sorted(names):
+        for name in sorted(options.started):
             self._logs[name] = options.record_directory / f"{name}.stderr"
             with open(self._logs[name], "wb") as log:
                 self._processes[name] = subprocess.Popen(

@@ -82,7 +82,7 @@ class RealtimeRig:
             settings = stack.enter_context(_bus_to_use(self.options))
             self.bus = stack.enter_context(open_bus(*settings))
             listener = stack.enter_context(open_bus(*settings))
-            self.processes = stack.enter_context(NodeProcesses(self.options, settings, self.options.started))
+            self.processes = stack.enter_context(NodeProcesses(self.options, settings))
             self._wait_for_both_sides(listener)
             notifier = can.Notifier(
                 listener,

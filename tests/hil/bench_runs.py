@@ -94,10 +94,10 @@ def wait_until(happened: Callable[[], Any], what: str) -> Any:
 
 
 @contextmanager
-def serving(channel: str) -> Iterator[Hub]:
+def serving(channel: str, bit_rate: int = 1_000_000) -> Iterator[Hub]:
     """Serve a bus in wall time from a thread."""
     stopped = StopFlag()
-    with Hub(Wire(1_000_000), channel, expected=None) as hub:
+    with Hub(Wire(bit_rate), channel, expected=None) as hub:
         server = Thread(target=hub.run_in_wall_time, args=(lambda: not stopped.is_set(),))
         server.start()
         try:

@@ -178,7 +178,7 @@ def test_a_side_that_is_told_nothing(home):
 def test_a_run_takes_channel_and_bit_rate_of_its_interface_from_the_configuration(home, capsys, tmp_path):
     write_canrc(home, channel="test", bitrate=500_000)
     run = ["run", "sine", "--mode", "realtime", "--rt-ratio", "0.1", "--duration", "0.05", "--json"]
-    with serving("test"):
+    with serving("test", bit_rate=500_000):
         assert cli.main([*run, "-i", "hilbus", "--out", str(tmp_path / "out")]) in (0, 1)
     assert json.loads(capsys.readouterr().out)["bit_rate"] == 500_000
 
