@@ -19,7 +19,7 @@ from hil.bus.wire_core import NEVER, arbitration_key
 
 __all__ = ["NEVER", "Clock", "FrameFault", "Port", "Wire", "arbitration_key"]
 
-_advance, _apply, _hand_over = (entry_point(f) for f in (at.advance, at.apply, at.hand_over))
+_advance, _hand_over = entry_point(at.advance), entry_point(at.hand_over)
 _local_ns, _bus_ns = entry_point(at.local_ns), entry_point(at.bus_ns)
 _QUEUE_ROWS = 4096
 _LOG_ROWS = 1 << 14
@@ -176,7 +176,8 @@ class Wire:
         words = self._mail[port.order]
         words[: at.FRAMES] = link.START, port.clock.local(self.now_ns)
         self._port_words[port.order, at.MAILED] = 0
-        self._apply(port, port.node.ask(port.packet[: at.FRAMES * 8], self._answer))
+        length = port.node.ask(port.packet[: at.FRAMES * 8], self._answer)
+        self._go_on(length, port.order, self.now_ns)
 
     def send(self, sender: int, ready_ns: int, frame: Frame) -> None:
         """Hand a frame to a CAN controller at bus time `ready_ns`, now or later.
@@ -231,23 +232,7 @@ class Wire:
 
     def run(self, until_ns: int) -> None:
         """Process every event before bus time `until_ns`."""
-        core, ports, places = self._core, self._port_words, self._ports
-        filters, mail, faults, out_of_band = self._filters, self._mail, self._faults, self._out_of_band
-        answer = self._answer_words
-        while True:
-            due = _advance(
-                core, ports, filters, self._queue, self._log, mail, faults, out_of_band, answer, until_ns
-            )
-            if due >= 0:
-                port = places[due & 0xFF]
-                self._apply(port, port.node.ask(port.packet[: due >> 8], self._answer))
-            elif due == at.NOBODY:
-                return
-            elif due == at.NO_ROOM:
-                self._make_room()
-            else:
-                port = places[at.NO_ANSWER - due]
-                self._apply(port, port.node.late_answer(self._answer))
+        self._go_on(0, 0, until_ns)
 
     def discard(self, rows: int) -> None:
         """Forget the oldest rows of the log."""
@@ -255,18 +240,38 @@ class Wire:
         self._log[: len(kept)] = kept
         self._core[at.LOGGED] = len(kept)
 
-    def _apply(self, port: Port, length: int) -> None:
-        if length:
-            _apply(
-                self._core,
-                self._port_words,
+    def _go_on(self, length: int, order: int, until_ns: int) -> None:
+        """Do what the node at a port has answered, then go on to `until_ns`."""
+        core, ports, places, answer = self._core, self._port_words, self._ports, self._answer
+        filters, mail, faults, out_of_band = self._filters, self._mail, self._faults, self._out_of_band
+        words = self._answer_words
+        while True:
+            due = _advance(
+                core,
+                ports,
+                filters,
                 self._queue,
-                self._faults,
-                self._out_of_band,
-                self._answer_words,
+                self._log,
+                mail,
+                faults,
+                out_of_band,
+                words,
                 length,
-                port.order,
+                order,
+                until_ns,
             )
+            if due >= 0:
+                order = due & 0xFF
+                port = places[order]
+                length = port.node.ask(port.packet[: due >> 8], answer)
+            elif due == at.NOBODY:
+                return
+            elif due == at.NO_ROOM:
+                self._make_room()
+                length = 0
+            else:
+                order = at.NO_ANSWER - due
+                length = places[order].node.late_answer(answer)
 
     def _make_room(self) -> None:
         """Double what may be full."""

@@ -268,31 +268,13 @@ def hand_over(core, queue, faults, out_of_band, sender, ready_ns, head, data):  
 
 @register_jitable
 def _apply(core, ports, queue, faults, out_of_band, answer, length, port):  # type: ignore[no-untyped-def]
+    """Do what a node wants: `answer` is in times of its own clock."""
     phase_ns, drift_ppb = ports[port, PHASE], ports[port, DRIFT_PPB]
     if answer[0] != NO_WAKE:
         ports[port, WAKE] = max(bus_ns(phase_ns, drift_ppb, answer[0]), core[NOW])
     for at in range(1, length // 8, FRAME_WORDS):
         ready_ns = bus_ns(phase_ns, drift_ppb, answer[at])
         _hand_over(core, queue, faults, out_of_band, port, ready_ns, answer[at + 1], answer[at + 2])
-
-
-@njit(
-    "void(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1], int64, int64)",
-    depends=("dbc.frame", "hil.bus.link"),
-)
-def apply(core, ports, queue, faults, out_of_band, answer, length, port):  # type: ignore[no-untyped-def]
-    """Do what a node wants.
-
-    Parameters
-    ----------
-    answer : array of int64
-        When it wants to wake, or `NO_WAKE`; then time, head and data of each frame; times of its own clock.
-    length : int
-        Of the answer, in bytes.
-    port : int
-        The node's.
-    """
-    _apply(core, ports, queue, faults, out_of_band, answer, length, port)
 
 
 @register_jitable
@@ -307,17 +289,28 @@ def _exchange(ports, mail, answer, port, length):  # type: ignore[no-untyped-def
 
 @njit(
     "int64(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[:,::1],"
-    " int64[::1], int64[::1], int64)",
+    " int64[::1], int64[::1], int64, int64, int64)",
     depends=("hil.bus.wire_time", "hil.bus.link", "dbc.frame"),
 )
-def advance(core, ports, filters, queue, log, mail, faults, out_of_band, answer, until_ns):  # type: ignore[no-untyped-def]
+def advance(  # type: ignore[no-untyped-def]
+    core, ports, filters, queue, log, mail, faults, out_of_band, answer, length, port, until_ns
+):
     """Process events before `until_ns`, up to the next one that a node in this process has to be asked about.
+
+    Parameters
+    ----------
+    answer : array of int64
+        What `port` answered: when it wants to wake, or `NO_WAKE`; then time, head and data of each frame.
+    length : int
+        Of the answer, in bytes; 0 if there is none.
 
     Returns
     -------
     int
         ``length of the packet << 8 | port`` of the node to ask, `NOBODY`, `NO_ROOM`, or `NO_ANSWER` - port.
     """
+    if length:
+        _apply(core, ports, queue, faults, out_of_band, answer, length, port)
     while True:
         if core[LOGGED] == log.shape[0] or core[QUEUED] + MAX_ANSWER_FRAMES > queue.shape[0]:
             return NO_ROOM
