@@ -1,5 +1,6 @@
 """The controller node: what its timer and receive interrupts do. Integers only."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,17 @@ class Controller:
             self._calibration = calibration.array()
             self._task[task.IS_CALIBRATED] = 1
             self._task[task.DEFAULT_LAW] = calibration.law
+        self._period = partial(
+            _period,
+            self._mailboxes,
+            self._expectations,
+            self._layout,
+            self._task,
+            self._calibration,
+            self._kernel_state,
+            self._io,
+            self._row,
+        )
         return Actions(next_period(now_ns))
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
@@ -109,17 +121,7 @@ class Controller:
         """Timer interrupt: one control period."""
         if self._bench_reset:
             self.on_start(now_ns)
-        payload = _period(
-            self._mailboxes,
-            self._expectations,
-            self._layout,
-            self._task,
-            self._calibration,
-            self._kernel_state,
-            self._io,
-            self._row,
-            now_ns,
-        )
+        payload = self._period(now_ns)
         self.record.append_array(self._row)
         send_ns = now_ns + EXECUTION_NS
         sends = [(send_ns, self._drive_command.frame(payload))]

@@ -117,12 +117,15 @@ class Supervisor:
         period = (now_ns - self._origin_ns) // PERIOD_NS
         frames = self._frames_of_change(period)
         reference_m, raw = self._position_in(period)
+        sends: tuple[tuple[int, Frame], ...] = ()
         if self._setpoint.can_id not in self.silent:
-            frames.insert(0, self._setpoint.frame(self._protect_setpoint(self._setpoint.pack(raw))))
+            payload = self._protect_setpoint(self._setpoint.pack(raw))
+            sends = ((now_ns, self._setpoint.frame(payload)),)
+        if frames:
+            sends += tuple((now_ns, frame) for frame in frames)
         self.record.append((now_ns, reference_m, raw, self._words["load_n"]))
         self.next_period = period + 1
-        wake_ns = self._origin_ns + self.next_period * PERIOD_NS
-        return Actions(wake_ns, tuple([(now_ns, frame) for frame in frames]))
+        return Actions(self._origin_ns + (period + 1) * PERIOD_NS, sends)
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
         """Hear nothing: the acceptance filter is empty."""
@@ -130,9 +133,11 @@ class Supervisor:
 
     def _frames_of_change(self, period: int) -> list[Frame]:
         """Return the frames beside the setpoint, in the order in which they are sent."""
+        commanded = period in _BRING_UP_COMMANDS or (period > 0 and period % _COMMAND_PERIODS == 0)
+        if period and not commanded and not (self._plan and self._plan[0][0] <= period):
+            return []
         frames = []
         loaded = period == 0
-        commanded = period in _BRING_UP_COMMANDS or (period > 0 and period % _COMMAND_PERIODS == 0)
         while self._plan and self._plan[0][0] <= period:
             _, _, words = heappop(self._plan)
             if reference := words.pop("reference", None):

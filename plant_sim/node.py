@@ -1,6 +1,7 @@
 """The machine's node: drive, position sensor and pressure sensors around the simulated plant."""
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -109,21 +110,8 @@ class Plant:
         self._time_ns += periods * PERIOD_NS
         frame, self._command_frame = self._command_frame, None
         arrived = frame is not None and frame.dlc == self._command_dlc
-        payload = _run_period(
-            self._state,
-            self._vector,
-            self._row,
-            periods,
-            self._drive.words,
-            self._receiver,
-            self._command_layout,
-            frame.data if frame is not None else 0,
-            arrived,
-            self._feedback_counter,
-            self._feedback_layout,
-            self._sensor.lsb_um,
-            self._sensor.noise_m(),
-        )
+        data = frame.data if frame is not None else 0
+        payload = self._run_period(periods, data, arrived, self._sensor.noise_m())
         self.record.append_array(self._row)
         sends = [(now_ns, self._feedback.frame(payload))]
         phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
@@ -148,6 +136,18 @@ class Plant:
         self._drive = Drive(self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2)
         self._row = np.zeros(len(COLUMNS))
         self._row[TIME] = self._time_ns
+        self._run_period = partial(
+            _run_period,
+            self._state,
+            self._vector,
+            self._row,
+            self._drive.words,
+            self._receiver,
+            self._command_layout,
+            self._feedback_counter,
+            self._feedback_layout,
+            self._sensor.lsb_um,
+        )
 
     def _take_bench_frames(self) -> None:
         contract = self._contract

@@ -48,23 +48,23 @@ _SENSOR_OK = 0
 
 
 @njit(
-    "uint64(float64[::1], float64[::1], float64[::1], int64,"
-    " int64[::1], int64[::1], int64[::1], uint64, int64, int64[::1], int64[::1], int64, float64)",
+    "uint64(float64[::1], float64[::1], float64[::1], int64[::1], int64[::1], int64[::1], int64[::1],"
+    " int64[::1], int64, int64, uint64, int64, float64)",
     depends=("dbc.e2e", "plant_sim"),
 )
 def run_period(  # type: ignore[no-untyped-def]
     state,
     parameters,
     row,
-    periods,
     drive,
     receiver,
     command,
-    data,
-    arrived,
     counter,
     feedback,
     lsb_um,
+    periods,
+    data,
+    arrived,
     noise_m,
 ):
     """Advance the plant, let the drive take its newest command, and return PositionFeedback's payload.
@@ -75,20 +75,22 @@ def run_period(  # type: ignore[no-untyped-def]
         See `plant_sim.layout`.
     row : array of float64, shape (len(COLUMNS),)
         The last period's row on entry, this one's on return.
-    periods : int
-        Periods to advance with what acted in the last one.
     drive : array of int64
         See `plant_sim.drive`.
     receiver : array of int64, shape (e2e.STATE_SIZE,)
         E2E state of DriveCommand.
     command, feedback : array of int64
         Layouts of DriveCommand and PositionFeedback, from `dbc.codec.MessageCodec.protected_layout`.
-    data, arrived : int
-        Payload of the newest DriveCommand; 0 if none arrived since the last call.
     counter : array of int64, shape (1,)
         E2E counter of PositionFeedback.
-    lsb_um, noise_m : int, float
-        The position sensor's resolution, and its error in this period.
+    lsb_um : int
+        Resolution of the position sensor.
+    periods : int
+        Periods to advance with what acted in the last one.
+    data, arrived : int
+        Payload of the newest DriveCommand; 0 if none arrived since the last call.
+    noise_m : float
+        Error of the position sensor in this period.
     """
     row[TIME] += periods * PERIOD_NS
     for _ in range(periods):

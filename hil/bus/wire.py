@@ -5,8 +5,10 @@ frame, and arbitration; at the same instant they come in this order, and wake-up
 nodes were attached. `hil.bus.wire_core` processes the events; here nodes come, go and are asked.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 
 import numpy as np
 
@@ -88,6 +90,7 @@ class Port:
     order: int
     clock: Clock
     packet: memoryview
+    ask: Callable[[memoryview, bytearray], int]
     connected: bool = True
 
 
@@ -115,7 +118,15 @@ class Wire:
         self._faults = np.zeros((at.MAX_FAULTS, at.FAULT_SIZE), np.int64)
         self._out_of_band = np.array(sorted(out_of_band), np.int64)
         self._answer = bytearray(link.MAX_PACKET)
-        self._answer_words = np.frombuffer(self._answer, np.int64)
+        self._advance = partial(
+            _advance,
+            self._core,
+            self._port_words,
+            self._mail,
+            self._faults,
+            self._out_of_band,
+            np.frombuffer(self._answer, np.int64),
+        )
         self._ports: list[Port] = []
 
     @property
@@ -151,7 +162,7 @@ class Wire:
             raise ValueError(f"a wire has room for {at.MAX_PORTS} nodes")
         clock = clock or Clock()
         asked = node if isinstance(node, link.Askable) else LocalNode(node)
-        port = Port(asked, order, clock, memoryview(self._mail[order]).cast("B"))
+        port = Port(asked, order, clock, memoryview(self._mail[order]).cast("B"), asked.ask)
         self._port_words[order] = NEVER, clock.phase_ns, clock.drift_ppb, 0, asked.link, 0
         self._core[at.PORTS] += 1
         self._ports.append(port)
@@ -176,7 +187,7 @@ class Wire:
         words = self._mail[port.order]
         words[: at.FRAMES] = link.START, port.clock.local(self.now_ns)
         self._port_words[port.order, at.MAILED] = 0
-        length = port.node.ask(port.packet[: at.FRAMES * 8], self._answer)
+        length = port.ask(port.packet[: at.FRAMES * 8], self._answer)
         self._go_on(length, port.order, self.now_ns)
 
     def send(self, sender: int, ready_ns: int, frame: Frame) -> None:
@@ -242,32 +253,19 @@ class Wire:
 
     def _go_on(self, length: int, order: int, until_ns: int) -> None:
         """Do what the node at a port has answered, then go on to `until_ns`."""
-        core, ports, places, answer = self._core, self._port_words, self._ports, self._answer
-        filters, mail, faults, out_of_band = self._filters, self._mail, self._faults, self._out_of_band
-        words = self._answer_words
+        places, answer = self._ports, self._answer
+        advance = partial(self._advance, self._filters, self._queue, self._log)
         while True:
-            due = _advance(
-                core,
-                ports,
-                filters,
-                self._queue,
-                self._log,
-                mail,
-                faults,
-                out_of_band,
-                words,
-                length,
-                order,
-                until_ns,
-            )
+            due = advance(length, order, until_ns)
             if due >= 0:
                 order = due & 0xFF
                 port = places[order]
-                length = port.node.ask(port.packet[: due >> 8], answer)
+                length = port.ask(port.packet[: due >> 8], answer)
             elif due == at.NOBODY:
                 return
             elif due == at.NO_ROOM:
                 self._make_room()
+                advance = partial(self._advance, self._filters, self._queue, self._log)
                 length = 0
             else:
                 order = at.NO_ANSWER - due

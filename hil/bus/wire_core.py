@@ -288,12 +288,12 @@ def _exchange(ports, mail, answer, port, length):  # type: ignore[no-untyped-def
 
 
 @njit(
-    "int64(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[:,::1],"
-    " int64[::1], int64[::1], int64, int64, int64)",
+    "int64(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1],"
+    " int64[:,::1], int64[:,::1], int64[:,::1], int64, int64, int64)",
     depends=("hil.bus.wire_time", "hil.bus.link", "dbc.frame"),
 )
 def advance(  # type: ignore[no-untyped-def]
-    core, ports, filters, queue, log, mail, faults, out_of_band, answer, length, port, until_ns
+    core, ports, mail, faults, out_of_band, answer, filters, queue, log, length, port, until_ns
 ):
     """Process events before `until_ns`, up to the next one that a node in this process has to be asked about.
 
