@@ -7,7 +7,7 @@ from pathlib import Path
 
 import can
 import pytest
-from bench_runs import SAFETY_NET_S, alive, background, children, command_line, wait_until
+from bench_runs import SAFETY_NET_S, alive, background, children, name_of, wait_until
 
 from dbc.contract import PACKAGED_DBC
 from hil import cli
@@ -277,7 +277,7 @@ def test_a_plant_that_never_answers(tmp_path, out):
     command = ["run", str(scenario), "--out", str(out), "-c", "test", "--answer-timeout", "1"]
     with background("hil", *command) as bench:
         (plant,) = wait_until(
-            lambda: [pid for pid in children(bench.pid) if "-m plant_sim" in command_line(pid)],
+            lambda: [pid for pid in children(bench.pid) if name_of(pid) == "hil-plant"],
             "the plant starts",
         )
         sides = children(bench.pid)

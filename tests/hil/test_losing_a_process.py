@@ -20,7 +20,7 @@ from bench_runs import (
     alive,
     background,
     children,
-    command_line,
+    name_of,
     short_scenario,
     wait_until,
 )
@@ -176,11 +176,7 @@ class Bench:
     def __init__(self, process: subprocess.Popen[str], out: Path) -> None:
         self.process = process
         self.out = out
-        self.sides = {}
-        for pid in children(process.pid):
-            for module, name in (("plant_sim", "plant"), ("firmware_py", "controller")):
-                if f"-m {module}" in command_line(pid):
-                    self.sides[name] = pid
+        self.sides = {name_of(pid).removeprefix("hil-"): pid for pid in children(process.pid)}
 
     def end(self) -> tuple[int, str]:
         """Wait for the bench and return exit code and standard error."""

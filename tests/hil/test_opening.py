@@ -3,7 +3,6 @@
 import errno
 import json
 import signal
-import sys
 from pathlib import Path
 
 import can
@@ -15,9 +14,8 @@ from hil import cli
 from hil.bus.hilbus import HilBus
 from hil.bus.opening import bus_settings, open_bus
 from hil.bus.socketcan import OutlivesInterruptions
-from hil.run.node_processes import NodeProcesses
-from hil.run.options import RunOptions
-from hil.scenario import load_scenario
+from hil.run.node_processes import side_arguments
+from hil.run.options import RigOptions
 
 
 @pytest.fixture(autouse=True)
@@ -190,23 +188,11 @@ def test_a_run_without_an_interface_is_on_a_bus_of_its_own_whatever_is_configure
 
 
 @pytest.mark.parametrize(("bit_rate", "arguments"), [(None, []), (500_000, ["-b", "500000"])])
-def test_the_bench_hands_the_bit_rate_to_both_sides(tmp_path, monkeypatch, bit_rate, arguments):
-    spy = tmp_path / "spy"
-    spy.write_text(f'#!{sys.executable}\nimport sys\nprint(" ".join(sys.argv), file=sys.stderr)\n')
-    spy.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(spy))
-    options = RunOptions(load_scenario("sine"), "adrc", record_directory=tmp_path)
-    with NodeProcesses(options, bus_settings("pcan", "PCAN_USBBUS1", bit_rate)) as processes:
-        processes.wait()
-        for name in ("plant", "controller"):
-            words = processes.last_words(name).split()
-            assert words[words.index("-i") : words.index("--rt-ratio")] == [
-                "-i",
-                "pcan",
-                "-c",
-                "PCAN_USBBUS1",
-            ]
-            assert words[words.index("-b") :][:2] == arguments if arguments else "-b" not in words
+def test_the_bench_hands_the_bit_rate_to_both_sides(tmp_path, bit_rate, arguments):
+    options = RigOptions(record_directory=tmp_path)
+    words = side_arguments(options, bus_settings("pcan", "PCAN_USBBUS1", bit_rate))
+    assert words[:4] == ["-i", "pcan", "-c", "PCAN_USBBUS1"]
+    assert words[words.index("-b") :] == arguments if arguments else "-b" not in words
 
 
 # an interface that is down for a while
