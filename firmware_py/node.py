@@ -78,37 +78,25 @@ class Controller:
         self.record = Record(task.RECORD_COLUMNS, "q")
 
     def on_start(self, now_ns: int) -> Actions:
-        """Power-on or reset: forget everything, check the calibration."""
-        self._mailboxes = mailbox.empty(self._expectations)
-        self._rows = dict(zip(self._received_ids, self._mailboxes, strict=True))
-        self._task = np.zeros(task.TASK_SIZE, np.int64)
-        self._kernel_state = np.zeros(k.ST_SIZE, np.int32)
-        self._io = np.zeros(k.IO_SIZE, np.int32)
-        self._bench_reset = False
-        self._cycle = 0
-        try:
-            calibration = Calibration.from_bytes(self._calibration_block)
-        except CalibrationError:
-            self._calibration = np.zeros(k.CAL_SIZE, np.int32)
-        else:
-            self._calibration = calibration.array()
-            self._task[task.IS_CALIBRATED] = 1
-            self._task[task.DEFAULT_LAW] = calibration.law
+        """Power-on: forget everything, check the calibration."""
+        self._empty_mailboxes()
+        self._restart_task()
         return Actions(next_period(now_ns))
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
-        """Receive interrupt: latch."""
+        """Receive interrupt: latch. A reset forgets what came before it, not what comes after."""
         row = self._rows.get(frame.can_id)
         if row is not None:
             _receive(row, frame.data, frame.dlc)
-        else:
-            self._bench_reset |= self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET
+        elif self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET:
+            self._empty_mailboxes()
+            self._bench_reset = True
         return NOTHING
 
     def on_timer(self, now_ns: int) -> Actions:
         """Timer interrupt: one control period."""
         if self._bench_reset:
-            self.on_start(now_ns)
+            self._restart_task()
         payload = _period(
             self._mailboxes,
             self._expectations,
@@ -129,6 +117,25 @@ class Controller:
             sends.append((send_ns, self._observer_frame()))
         self._cycle += 1
         return Actions(next_period(now_ns + 1), tuple(sends))
+
+    def _empty_mailboxes(self) -> None:
+        self._mailboxes = mailbox.empty(self._expectations)
+        self._rows = dict(zip(self._received_ids, self._mailboxes, strict=True))
+
+    def _restart_task(self) -> None:
+        self._task = np.zeros(task.TASK_SIZE, np.int64)
+        self._kernel_state = np.zeros(k.ST_SIZE, np.int32)
+        self._io = np.zeros(k.IO_SIZE, np.int32)
+        self._bench_reset = False
+        self._cycle = 0
+        try:
+            calibration = Calibration.from_bytes(self._calibration_block)
+        except CalibrationError:
+            self._calibration = np.zeros(k.CAL_SIZE, np.int32)
+        else:
+            self._calibration = calibration.array()
+            self._task[task.IS_CALIBRATED] = 1
+            self._task[task.DEFAULT_LAW] = calibration.law
 
     def _status_frame(self) -> Frame:
         status = self._contract.controller_status
