@@ -1,5 +1,6 @@
 """The table of requirements and the scenarios are the same list, on every interface."""
 
+import os
 import subprocess
 import sys
 from functools import cache
@@ -24,7 +25,7 @@ def scenarios_on(interface: str) -> frozenset[str]:
         [*command, "-p", "no:cacheprovider", "--ignore", __file__, *OPTIONS[interface], str(FOLDER)],
         capture_output=True,
         text=True,
-        env={"PYTEST_ADDOPTS": ""},
+        env=os.environ | {"PYTEST_ADDOPTS": ""},
     )
     assert done.returncode == 0, done.stdout + done.stderr
     lines = [line for line in done.stdout.splitlines() if "::" in line]
