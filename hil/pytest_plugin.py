@@ -100,7 +100,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.stash[_not_applicable] = lacking
     config.hook.pytest_deselected(items=out)
     items[:] = [item for item in items if item not in out]
-    config.stash[_applicable] = sum("bench" in getattr(item, "fixturenames", ()) for item in items)
+    config.stash[_applicable] = sum("_benches" in getattr(item, "fixturenames", ()) for item in items)
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:

@@ -145,11 +145,13 @@ class LockstepSession(VirtualSession):
         processes = self._rig.processes
         if gone.silent:
             processes.kill(gone.name)
-        self.wire.detach(self.ports[gone.name])
-        try:
-            self.wire.run(gone_ns + AFTERMATH_NS)
-        except NodeGoneError as another:
-            self.wire.detach(self.ports[another.name])
+        lost = gone
+        while self.wire.now_ns < gone_ns + AFTERMATH_NS:
+            self.wire.detach(self.ports[lost.name])
+            try:
+                self.wire.run(gone_ns + AFTERMATH_NS)
+            except NodeGoneError as another:
+                lost = another
         if gone.silent:
             raise BenchError(f"{at}: see why it hangs, or raise --answer-timeout") from gone
         stop = _motor_stop(self._records()["plant"], gone_ns)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -115,20 +116,16 @@ def test_after_a_loss_the_others_play_on_for_a_tenth_of_a_second_of_bus_time():
     """A fixed amount of work, whatever the machine: what makes the end come soon."""
     assert AFTERMATH_NS == 100 * PERIOD_NS
 
-    class LostRig:
-        options = RigOptions(record_directory=Path())
-        broken = False
-
-        class hub:
-            nodes = {"plant": Dying("plant"), "controller": Dying("controller")}
-            service = staticmethod(lambda: None)
-
-        class processes:
-            exit_code = staticmethod(lambda name: " (exit code 9)")
-
-        records = staticmethod(lambda: {"plant": None, "controller": None})
-
-    session = LockstepSession(LostRig, Wire(1_000_000), supervisor_of(short_scenario(1.0)), 0.0)
+    lost_rig = SimpleNamespace(
+        options=RigOptions(record_directory=Path()),
+        broken=False,
+        hub=SimpleNamespace(
+            nodes={"plant": Dying("plant"), "controller": Dying("controller")}, service=lambda: None
+        ),
+        processes=SimpleNamespace(exit_code=lambda name: " (exit code 9)"),
+        records=lambda: {"plant": None, "controller": None},
+    )
+    session = LockstepSession(lost_rig, Wire(1_000_000), supervisor_of(short_scenario(1.0)), 0.0)
     assert session.ending == "the plant process ended at bus time 0.000 s (exit code 9)"
     assert session.wire.now_ns == AFTERMATH_NS
     assert len(session.wire.traffic) >= 100
