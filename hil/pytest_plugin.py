@@ -139,14 +139,19 @@ def hil_rig(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> "Iterator[Callable[[], Rig]]":
     """Return what gives the rig of this test session; one that has lost a process is replaced."""
+    import can
+
     from hil.run.options import BenchError
     from hil.run.rig import RigKeeper
 
-    try:
-        with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
-            yield keeper.rig
-    except BenchError as error:
-        pytest.exit(f"hil: {error}", returncode=2)
+    def rig() -> "Rig":
+        try:
+            return keeper.rig()
+        except (BenchError, can.CanInitializationError) as error:
+            pytest.exit(f"hil: {error}", returncode=2)
+
+    with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
+        yield rig
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ _ARMING_PERIODS = (1, 2, 5, 9, 13)
 The others, like the repeated Enable, are for real time, where a side that stalls misses or overwrites some.
 """
 
-_ENABLE_PERIODS = (20, 24, 28)
+_ENABLE_PERIODS = (20, 24, 28, 32)
 
 _COMMAND_PERIODS = 100
 _CHUNK = 1000
