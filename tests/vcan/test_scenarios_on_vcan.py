@@ -1,5 +1,6 @@
 """The acceptance scenarios on a real vcan0, one after the other against two processes started by hand."""
 
+import os
 import re
 import subprocess
 import sys
@@ -34,7 +35,11 @@ def test_every_scenario_that_applies_to_socketcan_passes(
     ]
     command += ["--hil-mode", "realtime", "--hil-interface", "socketcan", "--hil-channel", CHANNEL]
     command += ["--rt-ratio", str(RT_RATIO), "--hil-out", str(tmp_path / "failed")]
-    with capfd.disabled(), subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    with (
+        capfd.disabled(),
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as run,
+    ):
         assert run.stdout is not None
         output = ""
         for line in run.stdout:
