@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from bench_runs import SAFETY_NET_S, background, busy_machine, wait_until
+from bench_runs import SAFETY_NET_S, background, busy_machine
 
 CHANNEL = "bench"
 RT_RATIO = "0.02"
