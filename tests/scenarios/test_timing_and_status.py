@@ -86,5 +86,5 @@ def test_the_pressures_on_the_bus_are_the_plants(bench):
         row = np.floor(shown.time_s / PERIOD_S).astype(int)
         assert len(shown) == 100
         assert shown.values == pytest.approx(bench.trace[column][row], abs=0.0051)
-        assert 2.0 < shown.values.min()
+        assert shown.values.min() > 2.0
         assert shown.max < 15.0
