@@ -1,8 +1,5 @@
 """The table of requirements and the scenarios are the same list, on every interface."""
 
-import os
-import subprocess
-import sys
 from functools import cache
 
 import pytest
@@ -14,22 +11,31 @@ OPTIONS = {
     "hilbus": ["--hil-mode=realtime"],
     "socketcan": ["--hil-mode=realtime", "--hil-interface=socketcan"],
 }
+QUIETLY = ["--collect-only", "-q", "-c", "/dev/null", "-p", "no:cacheprovider", "-p", "no:faulthandler"]
 TESTS = [row["test"] for row in TABLE["requirement"]]
+
+
+class Collected:
+    """What a session would run of this folder."""
+
+    scenarios: frozenset[str] = frozenset()
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        self.scenarios = frozenset(
+            f"{item.path.name}::{item.name}"
+            for item in session.items
+            if item.path.parent == FOLDER and item.module.__name__ != __name__
+        )
 
 
 @cache
 def scenarios_on(interface: str) -> frozenset[str]:
     """Collect this folder in a session of its own, so that nobody's -k or -x matters."""
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "--color=no", "-o", "addopts="]
-    done = subprocess.run(
-        [*command, "-p", "no:cacheprovider", "--ignore", __file__, *OPTIONS[interface], str(FOLDER)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTEST_ADDOPTS": ""},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    lines = [line for line in done.stdout.splitlines() if "::" in line]
-    return frozenset(line.rpartition("/")[2] for line in lines)
+    collected = Collected()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("PYTEST_ADDOPTS", raising=False)
+        assert pytest.main([*QUIETLY, *OPTIONS[interface], str(FOLDER)], plugins=[collected]) == 0
+    return collected.scenarios
 
 
 def test_every_requirement_has_its_scenario_and_every_scenario_its_requirement():
