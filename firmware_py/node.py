@@ -79,9 +79,41 @@ class Controller:
         self.record = Record(task.RECORD_COLUMNS, "q")
 
     def on_start(self, now_ns: int) -> Actions:
-        """Power-on or reset: forget everything, check the calibration."""
+        """Power-on: forget everything, check the calibration."""
+        self._empty_mailboxes()
+        self._restart_task()
+        return Actions(next_period(now_ns))
+
+    def on_frame(self, now_ns: int, frame: Frame) -> Actions:
+        """Receive interrupt: latch. A reset forgets what came before it, not what comes after."""
+        row = self._rows.get(frame.can_id)
+        if row is not None:
+            _receive(row, frame.data, frame.dlc)
+        elif self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET:
+            self._empty_mailboxes()
+            self._bench_reset = True
+        return NOTHING
+
+    def on_timer(self, now_ns: int) -> Actions:
+        """Timer interrupt: one control period."""
+        if self._bench_reset:
+            self._restart_task()
+        payload = self._period(now_ns)
+        self.record.append_array(self._row)
+        send_ns = now_ns + EXECUTION_NS
+        sends = [(send_ns, self._drive_command.frame(payload))]
+        if self._cycle % _STATUS_PERIODS == 0:
+            sends.append((send_ns, self._status_frame()))
+        if self._cycle % _OBSERVER_PERIODS == _OBSERVER_PHASE:
+            sends.append((send_ns, self._observer_frame()))
+        self._cycle += 1
+        return Actions(next_period(now_ns + 1), tuple(sends))
+
+    def _empty_mailboxes(self) -> None:
         self._mailboxes = mailbox.empty(self._expectations)
         self._rows = dict(zip(self._received_ids, self._mailboxes, strict=True))
+
+    def _restart_task(self) -> None:
         self._task = np.zeros(task.TASK_SIZE, np.int64)
         self._kernel_state = np.zeros(k.ST_SIZE, np.int32)
         self._io = np.zeros(k.IO_SIZE, np.int32)
@@ -106,31 +138,6 @@ class Controller:
             self._io,
             self._row,
         )
-        return Actions(next_period(now_ns))
-
-    def on_frame(self, now_ns: int, frame: Frame) -> Actions:
-        """Receive interrupt: latch."""
-        row = self._rows.get(frame.can_id)
-        if row is not None:
-            _receive(row, frame.data, frame.dlc)
-        else:
-            self._bench_reset |= self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET
-        return NOTHING
-
-    def on_timer(self, now_ns: int) -> Actions:
-        """Timer interrupt: one control period."""
-        if self._bench_reset:
-            self.on_start(now_ns)
-        payload = self._period(now_ns)
-        self.record.append_array(self._row)
-        send_ns = now_ns + EXECUTION_NS
-        sends = [(send_ns, self._drive_command.frame(payload))]
-        if self._cycle % _STATUS_PERIODS == 0:
-            sends.append((send_ns, self._status_frame()))
-        if self._cycle % _OBSERVER_PERIODS == _OBSERVER_PHASE:
-            sends.append((send_ns, self._observer_frame()))
-        self._cycle += 1
-        return Actions(next_period(now_ns + 1), tuple(sends))
 
     def _status_frame(self) -> Frame:
         status = self._contract.controller_status

@@ -194,8 +194,8 @@ class Bench:
         AssertionError
             Naming the periods that did not, and the frames involved.
         """
-        broken = self.timing.violations(limits)
-        assert not broken, f"{len(broken)} timing violations:\n" + "\n".join(map(str, broken[:10]))
+        if broken := self.timing.violations(limits):
+            raise AssertionError(f"{len(broken)} timing violations:\n" + "\n".join(map(str, broken[:10])))
 
     @property
     def controller_state(self) -> ControllerState | None:

@@ -213,7 +213,7 @@ def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) ->
 def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: int, mode: str) -> Timing:
     """Return the timing of the scenario's periods, those of the bring-up left out.
 
-    Of a real-time run the last period is left out, too: it is stopped at that period's start.
+    Of a real-time run the last period is left out, too: what belongs to it may come late.
     """
     periods = len(trace["time_s"]) - (mode == "realtime")
     controller = recording.controller

@@ -15,6 +15,7 @@ applicable, and counted as such.
 """
 
 import argparse
+import os
 import shlex
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -84,7 +85,7 @@ def interface_of(config: pytest.Config) -> str:
     return config.getoption("hil_interface") or "hilbus" if mode == "realtime" else mode
 
 
-@pytest.hookimpl(tryfirst=True)
+@pytest.hookimpl(trylast=True)  # what -k and -m leave
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect what needs what the interface lacks."""
     has = CAPABILITIES.get(interface_of(config), _OTHER_ADAPTER)
@@ -139,14 +140,19 @@ def hil_rig(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> "Iterator[Callable[[], Rig]]":
     """Return what gives the rig of this test session; one that has lost a process is replaced."""
+    import can
+
     from hil.run.options import BenchError
     from hil.run.rig import RigKeeper
 
-    try:
-        with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
-            yield keeper.rig
-    except BenchError as error:
-        pytest.exit(f"hil: {error}", returncode=2)
+    def rig() -> "Rig":
+        try:
+            return keeper.rig()
+        except (BenchError, can.CanInitializationError) as error:
+            pytest.exit(f"hil: {error}", returncode=2)
+
+    with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
+        yield rig
 
 
 @pytest.fixture
@@ -253,4 +259,5 @@ def _replay_command(item: pytest.Item) -> str:
         value = item.config.getoption(option.replace("-", "_"))
         if value is not None and any(str(argument).startswith(f"--{option}") for argument in given):
             options.append(f"--{option}={value}")
-    return shlex.join(["pytest", item.nodeid, *options])
+    path = os.path.relpath(item.path, item.config.invocation_params.dir)
+    return shlex.join(["pytest", "::".join([path, *item.nodeid.split("::")[1:]]), *options])

@@ -22,9 +22,13 @@ BRING_UP_S = BRING_UP_PERIODS * PERIOD_NS * 1e-9
 Reference = Callable[[np.ndarray], np.ndarray]
 """Position in m over an array of times in s, from the period at which it begins."""
 
-_ENABLE_PERIOD = 20
-_BRING_UP_COMMANDS = (1, 2)
-"""The first only starts the receiver's counter; the second, without Enable, arms the controller."""
+_ARMING_PERIODS = (1, 2, 5, 9, 13)
+"""When commands without Enable are sent: the first starts the receiver's counter, the second arms.
+
+The others, like the repeated Enable, are for real time, where a side that stalls misses or overwrites some.
+"""
+
+_ENABLE_PERIODS = (20, 24, 28, 32)
 
 _COMMAND_PERIODS = 100
 _CHUNK = 1000
@@ -82,7 +86,9 @@ class Supervisor:
         self._words = {"enable": 0, "law": 1 + CONTROLLERS.index(controller), "fault_reset": 0, "load_n": 0}
         self._plan: list[tuple[int, int, dict[str, int | Reference]]] = []
         self._planned = count()
-        self.plan(_ENABLE_PERIOD, enable=1)
+        for enable, periods in ((0, _ARMING_PERIODS), (1, _ENABLE_PERIODS)):
+            for period in periods:
+                self.plan(period, enable=enable)
 
     def plan(self, period: int, **words: int | Reference) -> None:
         """Change something in a period that is to come.
@@ -109,6 +115,7 @@ class Supervisor:
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: the machine is put to its initial state with the first period."""
         self._origin_ns = next_period(now_ns)
+        self.next_period = 0
         self.start_ns = self._origin_ns + BRING_UP_PERIODS * PERIOD_NS
         return Actions(self._origin_ns)
 
@@ -133,11 +140,12 @@ class Supervisor:
 
     def _frames_of_change(self, period: int) -> list[Frame]:
         """Return the frames beside the setpoint, in the order in which they are sent."""
-        commanded = period in _BRING_UP_COMMANDS or (period > 0 and period % _COMMAND_PERIODS == 0)
-        if period and not commanded and not (self._plan and self._plan[0][0] <= period):
+        is_first = self.next_period == 0  # it may come late, and then is not period 0
+        commanded = not is_first and period // _COMMAND_PERIODS > (self.next_period - 1) // _COMMAND_PERIODS
+        if not (is_first or commanded or (self._plan and self._plan[0][0] <= period)):
             return []
         frames = []
-        loaded = period == 0
+        loaded = is_first
         while self._plan and self._plan[0][0] <= period:
             _, _, words = heappop(self._plan)
             if reference := words.pop("reference", None):
@@ -147,7 +155,7 @@ class Supervisor:
             loaded |= "load_n" in words
             commanded |= bool(words.keys() & {"enable", "fault_reset"})
             self._words |= words  # type: ignore[arg-type]
-        if period == 0:
+        if is_first:
             frames.append(self._reset_frame())
         if commanded and self._command.can_id not in self.silent:
             frames.append(self._command_frame())

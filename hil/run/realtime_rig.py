@@ -6,19 +6,19 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from fractions import Fraction
+from itertools import pairwise
+from statistics import median
 from threading import Thread
 from typing import Self
 
 import can
-import numpy as np
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
-from hil.bus.messages import to_frame
 from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock, Port
-from hil.run.node_processes import NodeProcesses, load_record
+from hil.run.listener import Listener
+from hil.run.node_processes import MODULES, NodeProcesses, load_record
 from hil.run.options import (
     HUB_GREETING,
     INTERRUPTED,
@@ -29,14 +29,19 @@ from hil.run.options import (
     RigOptions,
     RunOptions,
 )
-from hil.run.realtime import RealtimeNode, shared_ns
+from hil.run.realtime import RealtimeNode
 from hil.run.rig import play
-from hil.supervisor import Supervisor
+from hil.supervisor import BRING_UP_PERIODS, Supervisor
 
 _POLL_S = 0.05
-_WAIT_S = 0.002
-_CHECK_INTERVAL_S = 0.1
+_SHORTEST_WAIT_S, _LONGEST_WAIT_S = 0.001, 0.1
 _GOODBYE_PERIODS = 5
+_MEASURED_PERIODS = 10
+_SAME_RATIO = 1.5
+"""Factor up to which a measured ratio is that of the bench: a machine that stalls delays some frames."""
+
+_ANSWER_TIMEOUT_S = 10.0
+"""How long sides that were heard before may be silent between two sessions, s."""
 
 
 def run_realtime(options: RunOptions) -> Recording:
@@ -73,7 +78,6 @@ class RealtimeRig:
         self.options = options
         self.bit_rate = options.wire_bit_rate
         self.begin_s = time.perf_counter()
-        self.heard: list[tuple[int, can.Message]] = []
         self._session: RealtimeSession | None = None
         self._stack = ExitStack()
 
@@ -81,15 +85,10 @@ class RealtimeRig:
         with ExitStack() as stack:
             settings = stack.enter_context(_bus_to_use(self.options))
             self.bus = stack.enter_context(open_bus(*settings))
-            listener = stack.enter_context(open_bus(*settings))
+            self.listener = Listener(stack.enter_context(open_bus(*settings)))
             self.processes = stack.enter_context(NodeProcesses(self.options, settings))
-            self._wait_for_both_sides(listener)
-            notifier = can.Notifier(
-                listener,
-                [lambda message: self.heard.append((time.monotonic_ns(), message))],
-                timeout=_POLL_S,
-            )
-            stack.callback(notifier.stop)
+            stack.enter_context(self.listener.listening())
+            self._wait_for_both_sides(self.options.start_timeout_s)
             stack.callback(self._end_session)
             self._stack = stack.pop_all()
         return self
@@ -107,7 +106,7 @@ class RealtimeRig:
         if bit_rate not in (None, self.bit_rate):
             raise BenchError(f"this bus runs at {self.bit_rate} bit/s: the test needs virtual time")
         self._end_session()
-        self.heard.clear()
+        self._wait_for_both_sides(min(self.options.start_timeout_s, _ANSWER_TIMEOUT_S))
         self._session = RealtimeSession(self, Supervisor(self.contract, controller, position_m))
         return self._session
 
@@ -123,30 +122,60 @@ class RealtimeRig:
         if self._session is not None:
             self._session.end()
 
-    def _wait_for_both_sides(self, listener: can.BusABC) -> None:
-        options, contract = self.options, self.contract
-        waiting_for = {
-            contract.position_feedback.can_id: "plant",
-            contract.drive_command.can_id: "controller",
-        }
-        deadline_s = time.monotonic() + options.start_timeout_s
-        while waiting_for:
-            self.processes.check()
+    def check(self) -> None:
+        """Make sure that what was started here lives, and that the bus is heard.
+
+        Raises
+        ------
+        BenchError
+            With what went wrong.
+        """
+        self.processes.check()
+        if self.listener.raised is not None:
+            raise BenchError(str(self.listener.raised))
+
+    def _wait_for_both_sides(self, timeout_s: float) -> None:
+        """Wait until both sides are heard from now on, and make sure that they keep our time."""
+        self.listener.forget()
+        options, beacons = self.options, self._beacons
+        silent, times = list(beacons), {}
+        deadline_s = time.monotonic() + timeout_s
+        while silent:
+            self.check()
             if options.stopped.is_set():
                 raise InterruptedRunError("interrupted during start-up")
             if time.monotonic() > deadline_s:
-                missing = next(iter(waiting_for.values()))
-                remedy = "raise --start-timeout if this machine is slow"
-                if missing not in options.started:
-                    module = {"plant": "plant_sim", "controller": "firmware_py"}[missing]
-                    remedy = f"start it with `python -m {module} -i ... -c ...`"
-                raise BenchError(
-                    f"nothing was heard of the {missing} on {listener.channel_info} within "
-                    f"{options.start_timeout_s:g} s: {remedy}"
-                )
-            message = listener.recv(_POLL_S)
-            if message is not None and not message.is_extended_id:
-                waiting_for.pop(message.arbitration_id, None)
+                raise BenchError(self._what_is_missing(silent[0], timeout_s))
+            time.sleep(_POLL_S)
+            times = {side: self.listener.times_ns(can_id) for side, can_id in beacons.items()}
+            silent = [side for side in beacons if len(times[side]) <= _MEASURED_PERIODS]
+        for side in SIDES - options.started:
+            self._check_ratio(side, times[side])
+
+    @property
+    def _beacons(self) -> dict[str, int]:
+        """What each side sends once a period."""
+        return {
+            "plant": self.contract.position_feedback.can_id,
+            "controller": self.contract.drive_command.can_id,
+        }
+
+    def _what_is_missing(self, side: str, timeout_s: float) -> str:
+        remedy = "raise --start-timeout if this machine is slow"
+        if side not in self.options.started:
+            ratio = float(self.options.rt_ratio)
+            remedy = f"start it with `python -m {MODULES[side]} -i ... -c ... --rt-ratio {ratio:g}`"
+        where = self.bus.channel_info
+        return f"nothing was heard of the {side} on {where} within {timeout_s:g} s: {remedy}"
+
+    def _check_ratio(self, side: str, times_ns: list[int]) -> None:
+        ours = float(self.options.rt_ratio)
+        theirs = PERIOD_NS / max(median(after - before for before, after in pairwise(times_ns)), 1)
+        if not 1 / _SAME_RATIO < theirs / ours < _SAME_RATIO:
+            raise BenchError(
+                f"the {side} runs at --rt-ratio {theirs:.2g}, this bench at {ours:g}: "
+                "start both with the same, one that the machine can keep"
+            )
 
 
 class RealtimeSession:
@@ -170,15 +199,16 @@ class RealtimeSession:
         self._goodbye: int | None = None
         self._stopping = False
         self._raised: Exception | None = None
-        self._check_s = 0.0
         self._reached = 0
         self._thread = Thread(target=self._run, name="supervisor", daemon=True)
         self._thread.start()
 
     def run_to(self, period: int) -> None:
-        """Wait until the start of a period, counted from power-on."""
-        while self.supervisor.next_period < period and not self.ending:
-            time.sleep(_WAIT_S)
+        """Wait until a period, counted from power-on, has begun, and all before it is over."""
+        period_s = PERIOD_NS / 1e9 / float(self._rig.options.rt_ratio)
+        while self.supervisor.next_period <= period and not self.ending:
+            wait_s = (period - self.supervisor.next_period) * period_s
+            time.sleep(min(max(wait_s, _SHORTEST_WAIT_S), _LONGEST_WAIT_S))
             self._check()
         self._reached = min(period, self.supervisor.next_period)
         self._wall_s = time.perf_counter() - self._begin_s
@@ -186,12 +216,14 @@ class RealtimeSession:
     def recording(self) -> Recording:
         """Return what there is up to where `run_to` came; records only of processes that have ended."""
         options, supervisor = self._rig.options, self.supervisor.record.columns_by_name()
-        shown = supervisor["time_ns"] < supervisor["time_ns"][:1] + self._reached * PERIOD_NS
-        traffic = _traffic(list(self._rig.heard), options.rt_ratio)
-        until_ns = supervisor["time_ns"][0] + self._reached * PERIOD_NS if len(shown) else 0
+        begin_ns = self.supervisor.start_ns - BRING_UP_PERIODS * PERIOD_NS
+        until_ns = begin_ns + self._reached * PERIOD_NS
+        shown = supervisor["time_ns"] < until_ns
+        traffic = self._rig.listener.traffic(options.rt_ratio)
+        times_ns = traffic[:, 0]
         records = {name: load_record(options, name) for name in SIDES & options.started}
         return Recording(
-            traffic=traffic[traffic[:, 0] < until_ns],
+            traffic=traffic[(times_ns >= begin_ns) & (times_ns < until_ns)],
             supervisor={name: column[shown] for name, column in supervisor.items()},
             plant=records.get("plant"),
             controller=records.get("controller"),
@@ -234,13 +266,10 @@ class RealtimeSession:
 
     def _check(self) -> None:
         """See whether something has ended the run."""
-        if time.monotonic() < self._check_s:
-            return
-        self._check_s = time.monotonic() + _CHECK_INTERVAL_S
         try:
             if self._raised is not None:
                 raise BenchError(str(self._raised))
-            self._rig.processes.check()
+            self._rig.check()
         except BenchError as error:
             self.ending, self.broken = str(error), True
         if self._rig.options.stopped.is_set():
@@ -272,17 +301,3 @@ def _bus_to_use(options: RigOptions) -> Iterator[BusSettings]:
     finally:
         hub.terminate()
         hub.wait()
-
-
-def _traffic(heard: list[tuple[int, can.Message]], ratio: Fraction) -> np.ndarray:
-    """Put the log on the nodes' time base: the frame that was passed on fastest ties the two clocks."""
-    data = [(ns, m) for ns, m in heard if not (m.is_error_frame or m.is_remote_frame or m.is_fd)]
-    offset_ns = min((ns - round(message.timestamp * 1e9) for ns, message in data), default=0)
-    rows = [
-        (
-            shared_ns(round(message.timestamp * 1e9) + offset_ns, ratio),
-            *to_frame(message),
-        )
-        for _, message in data
-    ]
-    return np.array(rows, dtype=np.uint64).reshape(-1, 4)

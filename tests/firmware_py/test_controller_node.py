@@ -459,6 +459,15 @@ def test_a_bench_reset_forgets_everything(running):
     assert controller_status(running)["MailboxOverruns"] == 0
 
 
+def test_what_comes_after_a_bench_reset_in_the_same_period_is_not_forgotten(running):
+    """A timer that is late finds the reset, and what was sent after it, at once."""
+    bench = CONTRACT.bench_control
+    running.hear(bench.frame(bench.pack(BenchCommand.RESET, 0, 0)))
+    set_inputs(running, enable=0).period()
+    running.period()  # without what came in the period of the reset, this one would only start the counters
+    assert set_inputs(running, enable=1).period().state == State.RUN
+
+
 def test_a_restarted_controller_does_not_move_on_an_enable_that_was_held_all_along(running):
     running.controller.on_start(running.now_ns)
     assert running.periods(20).state == State.STANDBY

@@ -722,22 +722,29 @@ def test_frames_lie_in_packets_as_in_socketcan():
     assert link.unpack_timed(link.pack_timed(-5, frame)) == (-5, frame)
 
 
-def test_bus_time_in_wall_time_follows_the_clock_and_never_runs_ahead():
-    """One frame per turn of the loop: each starts when it was sent, the last one never ends."""
-    turns_ns = (0, 50_000_000, 51_000_000)
-    clock_ns = origin_ns = 7_000_000_000
-    frame = Frame(0x123, 3, 0x030201)
+@contextmanager
+def two_programs() -> Iterator[tuple[Hub, socket.socket, socket.socket]]:
+    """A hub that is not running yet, and the links of two programs on its bus."""
     with (
         Hub(Wire(1_000_000), "test", expected=None) as hub,
-        link.seqpacket_socket() as sender,
-        link.seqpacket_socket() as receiver,
+        link.seqpacket_socket() as one,
+        link.seqpacket_socket() as other,
     ):
-        for end in (sender, receiver):
+        for end in (one, other):
             end.connect(os.fspath(link.socket_path("test")))
             link.send_json(end, {"version": link.PROTOCOL_VERSION, "role": "bus"})
             for _ in range(3):
                 hub.service()
             assert link.receive_json(end)["virtual"] is False
+        yield hub, one, other
+
+
+def test_bus_time_in_wall_time_follows_the_clock_and_never_runs_ahead():
+    """One frame per turn of the loop: each starts when it was sent, the last one never ends."""
+    turns_ns = (0, 50_000_000, 51_000_000)
+    clock_ns = origin_ns = 7_000_000_000
+    frame = Frame(0x123, 3, 0x030201)
+    with two_programs() as (hub, sender, receiver):
 
         def turns() -> Iterator[bool]:
             nonlocal clock_ns
@@ -754,3 +761,30 @@ def test_bus_time_in_wall_time_follows_the_clock_and_never_runs_ahead():
             receiver.recv(link.MAX_PACKET)
     duration_ns = (frame_bits(message()) - INTERMISSION_BITS) * 1000
     assert ends_ns == [turn_ns + duration_ns for turn_ns in turns_ns[:2]]
+
+
+def test_a_frame_that_ends_between_two_looks_at_the_links_is_passed_on_before_the_hub_waits():
+    """The clock is read before and after each wait: the frame must have come by the second reading."""
+    readings: list[bool] = []
+    with two_programs() as (hub, sender, receiver):
+        receiver.setblocking(False)
+
+        def clock_ns() -> int:
+            try:
+                readings.append(bool(receiver.recv(link.MAX_PACKET)))
+            except BlockingIOError:
+                readings.append(False)
+            return now_ns
+
+        def turns() -> Iterator[bool]:
+            nonlocal now_ns
+            sender.send(link.pack_frame(Frame(0x123, 3, 0x030201)))
+            yield True  # the frame is taken
+            readings.clear()
+            now_ns += 1_000_000
+            yield True  # it has ended
+            yield False
+
+        now_ns = 0
+        hub.run_in_wall_time(turns().__next__, clock_ns)
+    assert readings == [False, True]

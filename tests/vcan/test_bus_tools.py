@@ -12,10 +12,9 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from fractions import Fraction
 from pathlib import Path
 from threading import Event
 
@@ -23,8 +22,20 @@ import can
 import numpy as np
 import pytest
 from guest_init import create_link, delete_link, set_link
+from hand_started import (
+    CHANNEL,
+    COMMAND,
+    CONTRACT,
+    FEEDBACK,
+    RT_RATIO,
+    SAFETY_NET_S,
+    Side,
+    both_sides,
+    hear_both,
+    wait_for,
+)
 
-from dbc.contract import PACKAGED_DBC, Contract
+from dbc.contract import PACKAGED_DBC
 from hil.bus.opening import open_bus
 from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import Clock
@@ -33,66 +44,17 @@ from hil.scenario import load_scenario
 from hil.supervisor import Supervisor
 from plant_sim.drive import State as DriveState
 
-CHANNEL = "vcan0"
-RT_RATIO = Fraction(1, 50)
-"""A period is 50 ms of wall time."""
-SAFETY_NET_S = 300.0
-CONTRACT = Contract.load()
-COMMAND, FEEDBACK, STATUS = (
-    message.can_id
-    for message in (CONTRACT.drive_command, CONTRACT.position_feedback, CONTRACT.controller_status)
-)
+STATUS = CONTRACT.controller_status.can_id
 BACKGROUND = 0x6F0
 """Of lower priority than everything in the contract."""
 RUN, SAFE = 2, 3
 STALE_PERIODS = 3
 
 
-class Side:
-    """A node process, started as a user would."""
-
-    def __init__(self, module: str, name: str, folder: Path) -> None:
-        self.record = folder / f"{name}.npz"
-        self.stderr = folder / f"{name}.stderr"
-        command = [sys.executable, "-m", module, "-i", "socketcan", "-c", CHANNEL]
-        command += ["--rt-ratio", str(RT_RATIO), "--record", str(folder)]
-        with open(self.stderr, "w") as stderr:
-            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=stderr)
-
-    def said(self) -> list[str]:
-        return self.stderr.read_text().splitlines()
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
-
-
 @pytest.fixture(scope="module")
 def sides(tmp_path_factory) -> Iterator[dict[str, Side]]:
-    folder = tmp_path_factory.mktemp("record")
-    sides = {"plant": Side("plant_sim", "plant", folder)}
-    try:
-        sides["controller"] = Side("firmware_py", "controller", folder)
-        hear_both()
+    with both_sides(tmp_path_factory.mktemp("record")) as sides:
         yield sides
-    finally:
-        for side in sides.values():
-            side.kill()
-            print(*side.said(), sep="\n")
-
-
-def wait_for(bus: can.BusABC, what: Callable[[can.Message], bool]) -> can.Message:
-    deadline_s = time.monotonic() + SAFETY_NET_S
-    while (message := bus.recv(1.0)) is None or not what(message):
-        assert time.monotonic() < deadline_s, "waited in vain"
-    return message
-
-
-def hear_both() -> None:
-    """Wait until both sides are heard, from now on."""
-    with can.Bus(interface="socketcan", channel=CHANNEL) as bus:
-        for can_id in (COMMAND, FEEDBACK):
-            wait_for(bus, lambda message, can_id=can_id: message.arbitration_id == can_id)
 
 
 def hear_state(state: int) -> can.Message:
@@ -186,9 +148,11 @@ def assert_no_gap(numbers: list[int], modulus: int) -> None:
 def supervised() -> Iterator[None]:
     """Reset both sides, enable the controller, and play a scenario that is longer than any test."""
     stopped = Event()
-    supervisor = Supervisor(CONTRACT, load_scenario("sine"), "adrc")
+    supervisor = Supervisor(CONTRACT, "adrc")
+    supervisor.plan_scenario(load_scenario("sine"))
     with open_bus("socketcan", CHANNEL, None) as bus, ThreadPoolExecutor() as executor:
         runner = RealtimeNode(supervisor, bus, RT_RATIO, Clock())
+        runner.start()
         future = executor.submit(runner.run, lambda: not stopped.is_set())
         try:
             yield

@@ -1,0 +1,82 @@
+"""What a real-time bench hears: every frame on the bus, and when."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from threading import Thread
+
+import can
+import numpy as np
+
+from hil.bus.messages import to_frame
+from hil.run.realtime import fifo_scheduling, shared_ns
+
+_POLL_S = 0.05
+
+
+class Listener:
+    """Logs a bus from a thread of its own.
+
+    The thread has the priority of the nodes: one of ordinary priority would keep the interpreter from the
+    supervisor for as long as other programs keep it from the processor.
+
+    Parameters
+    ----------
+    bus : can.BusABC
+        Only listened to.
+
+    Attributes
+    ----------
+    raised : Exception or None
+        Why it hears no more.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.raised: Exception | None = None
+        self._bus = bus
+        self._stopping = False
+        self._heard: list[tuple[int, int, int, int, int]] = []  # heard, stamped (ns), id, dlc, data
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen for the length of the context."""
+        thread = Thread(target=self._run, name="listener", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stopping = True
+            thread.join()
+
+    def forget(self) -> None:
+        """Forget what was heard so far."""
+        self._heard = []
+
+    def times_ns(self, can_id: int) -> list[int]:
+        """Return the bus's own time stamps of a message, ns."""
+        return [stamp_ns for _, stamp_ns, heard_id, _, _ in self._heard if heard_id == can_id]
+
+    def traffic(self, ratio: Fraction) -> np.ndarray:
+        """Return what was heard on the nodes' time base; see `hil.run.options.Recording`.
+
+        The frame that was passed on fastest ties the bus's clock to ours.
+        """
+        heard = list(self._heard)
+        offset_ns = min((heard_ns - stamp_ns for heard_ns, stamp_ns, *_ in heard), default=0)
+        rows = [(shared_ns(stamp_ns + offset_ns, ratio), *frame) for _, stamp_ns, *frame in heard]
+        return np.array(rows, dtype=np.uint64).reshape(-1, 4)
+
+    def _run(self) -> None:
+        try:
+            with fifo_scheduling():
+                while not self._stopping:
+                    message = self._bus.recv(_POLL_S)
+                    if message is not None:
+                        self._take(message)
+        except (can.CanError, OSError) as error:
+            self.raised = error
+
+    def _take(self, message: can.Message) -> None:
+        if not (message.is_error_frame or message.is_remote_frame or message.is_fd):
+            self._heard.append((time.monotonic_ns(), round(message.timestamp * 1e9), *to_frame(message)))

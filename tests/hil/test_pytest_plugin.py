@@ -1,0 +1,268 @@
+"""The bench in pytest, as its users run it: sessions of pytest in processes of their own."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from bench_runs import SAFETY_NET_S
+
+from hil.bench import Bench
+from hil.run.inprocess import InprocessRig
+from hil.run.options import RigOptions
+from hil.scenario import TimingLimits
+
+ROOT = Path(__file__).parents[2]
+DOCS = (ROOT / "docs/testing.md").read_text(encoding="utf-8")
+
+USER_TESTS = """
+import pytest
+
+def test_passes(bench):
+    bench.run(0.05)
+    assert bench.error_mm.max < 1.0
+
+def test_fails(bench):
+    bench.setpoint(0.01)
+    bench.run(0.05)
+    assert bench.error_mm.max < 0.0
+
+@pytest.mark.bench(controller="pi", position_m=0.2, bit_rate=500_000)
+def test_begins_as_marked(bench):
+    bench.run(0.05)
+    assert (bench.controller, bench.bit_rate) == ("pi", 500_000)
+    assert bench.position_mm.last == pytest.approx(200.0, abs=1.0)
+
+@pytest.mark.needs("wire_faults")
+def test_spoils_the_wire(bench):
+    bench.drop("PositionFeedback")
+    bench.run(0.05)
+
+def test_two_benches(bench_at):
+    assert bench_at(position_m=0.1).position_mm is not bench_at(position_m=0.2)
+
+def test_without_a_bench():
+    pass
+"""
+
+LOSES_ITS_FIRMWARE = """
+import os, signal
+from pathlib import Path
+
+def firmware():
+    for entry in Path("/proc").iterdir():
+        try:
+            parent = (entry / "stat").read_text().rpartition(")")[2].split()[1]
+            command = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if parent == str(os.getpid()) and b"firmware_py" in command:
+            return int(entry.name)
+
+def test_before(bench):
+    bench.run(0.02)
+
+def test_that_loses_it(bench):
+    bench.run(0.02)
+    os.kill(firmware(), signal.SIGKILL)
+    bench.run(0.02)
+
+def test_after(bench):
+    bench.run(0.02)
+    assert bench.controller_state == 2
+"""
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session of pytest that is over."""
+
+    folder: Path
+    code: int
+    said: str
+
+    @property
+    def lines(self) -> list[str]:
+        return self.said.splitlines()
+
+    def properties(self) -> dict[str, list[tuple[str, str]]]:
+        """Return the properties of each test case in the JUnit file."""
+        cases = ET.parse(self.folder / "junit.xml").iter("testcase")
+        return {
+            f"{case.get('classname')}.{case.get('name')}": [
+                (p.get("name", ""), p.get("value", "")) for p in case.iter("property")
+            ]
+            for case in cases
+        }
+
+
+def run_pytest(folder: Path, *arguments: str, cwd: Path | None = None) -> Session:
+    sockets = folder / "sockets"
+    sockets.mkdir(exist_ok=True, mode=0o700)
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--color=no", *arguments],
+        cwd=cwd or folder,
+        capture_output=True,
+        text=True,
+        timeout=10 * SAFETY_NET_S,
+        env=os.environ | {"XDG_RUNTIME_DIR": str(sockets), "PYTEST_ADDOPTS": "", "COLUMNS": "240"},
+    )
+    return Session(folder, done.returncode, done.stdout + done.stderr)
+
+
+def user_session(folder: Path, tests: str, *arguments: str) -> Session:
+    (folder / "test_user.py").write_text(tests)
+    (folder / "pytest.ini").write_text("[pytest]\naddopts = --strict-markers\n")
+    return run_pytest(folder, "--junitxml=junit.xml", *arguments)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return user_session(tmp_path_factory.mktemp("user"), USER_TESTS, "--hil-mode=inprocess")
+
+
+def test_the_session_ends_as_its_tests_did(session):
+    assert session.code == 1
+    assert "1 failed, 5 passed" in session.said
+    assert "hil: 5 scenarios on inprocess, 4 passed; 0 not applicable (none)" in session.lines
+
+
+def test_a_failing_test_leaves_its_folder_and_says_where(session):
+    folder = session.folder / "out/pytest/test_fails"
+    assert {file.name for file in folder.iterdir()} == {
+        "result.json",
+        "trace.csv",
+        "bus.log",
+        "picture.png",
+    }
+    assert "results in out/pytest/test_fails" in session.lines
+    assert [entry.name for entry in folder.parent.iterdir()] == ["test_fails"]
+
+
+def test_the_replay_command_replays_the_run_to_the_last_bit(session, tmp_path):
+    command = next(line for line in session.lines if line.startswith("replay: "))
+    program, *arguments = shlex.split(command.removeprefix("replay: "))
+    assert program == "pytest"
+    result = session.folder / "out/pytest/test_fails/result.json"
+    again = run_pytest(session.folder, *arguments, f"--hil-out={tmp_path}")
+    assert again.code == 1
+    sha256 = json.loads(result.read_text())["bus_sha256"]
+    assert json.loads((tmp_path / "test_fails/result.json").read_text())["bus_sha256"] == sha256
+
+
+def test_the_replay_command_holds_where_pytest_was_started(session, tmp_path):
+    again = run_pytest(
+        session.folder,
+        "--hil-mode=inprocess",
+        f"--hil-out={tmp_path}",
+        f"{session.folder.name}/test_user.py::test_fails",
+        cwd=session.folder.parent,
+    )
+    assert (
+        f"replay: pytest {session.folder.name}/test_user.py::test_fails --hil-mode=inprocess" in again.lines
+    )
+
+
+def test_figures_go_into_the_junit_file(session):
+    figures = dict(session.properties()["test_user.test_fails"])
+    result = json.loads((session.folder / "out/pytest/test_fails/result.json").read_text())
+    assert figures["bench"] == "inprocess"
+    assert float(figures["rms_mm"]) == result["rms_mm"]
+    assert float(figures["latency_us_p99"]) == result["timing"]["latency_us"]["p99"]
+    assert figures["missed_periods"] == "0"
+    assert figures["bus_sha256"] == result["bus_sha256"]
+    assert session.properties()["test_user.test_without_a_bench"] == []
+
+
+def test_what_the_interface_lacks_is_not_applicable_and_counted(tmp_path):
+    collected = user_session(tmp_path, USER_TESTS, "--hil-mode=realtime", "--collect-only", "-q")
+    assert "hil: 4 scenarios on hilbus, 0 passed; 1 not applicable (1 need wire_faults)" in collected.lines
+    assert "test_spoils_the_wire" not in collected.said
+
+
+def test_only_what_was_selected_is_counted(tmp_path):
+    selected = user_session(tmp_path, USER_TESTS, "--hil-mode=realtime", "--collect-only", "-k", "passes")
+    assert "hil: 1 scenarios on hilbus, 0 passed; 0 not applicable (none)" in selected.lines
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--hil-interface=hilbus"], "--hil-interface needs --hil-mode realtime"),
+        (["--hil-mode=realtime", "--rt-ratio=0"], "--rt-ratio: "),
+        (["--hil-mode=realtime", "--rt-ratio=fast"], "--rt-ratio: "),
+        (["--hil-mode=fast"], "argument --hil-mode: invalid choice: 'fast'"),
+    ],
+)
+def test_a_wrong_option_is_refused_with_one_line(tmp_path, arguments, said):
+    refused = user_session(tmp_path, USER_TESTS, *arguments)
+    assert refused.code == 4
+    assert len([line for line in refused.lines if said in line]) == 1
+    assert "Traceback" not in refused.said
+
+
+def test_a_need_that_nothing_has_is_refused(tmp_path):
+    refused = user_session(tmp_path, USER_TESTS.replace("wire_faults", "wirefaults"), "--hil-mode=inprocess")
+    assert refused.code == 4
+    assert "ERROR: test_user.py::test_spoils_the_wire: nothing has 'wirefaults'" in refused.lines
+
+
+def test_a_lost_process_fails_its_test_only(tmp_path):
+    session = user_session(tmp_path, LOSES_ITS_FIRMWARE)
+    assert session.code == 1
+    assert "1 failed, 2 passed" in session.said
+    said = r"FAILED test_user\.py::test_that_loses_it - .*BenchError: the controller process ended .*"
+    assert [line for line in session.lines if re.fullmatch(said, line)], session.said
+
+
+# docs/testing.md
+
+
+def code_blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", DOCS, re.DOTALL)
+
+
+def test_the_example_in_the_documentation_passes(tmp_path):
+    (example,) = code_blocks("python")
+    session = user_session(tmp_path, example, "--hil-mode=inprocess")
+    assert session.code == 0, session.said
+    assert f"{example.count('def test_')} passed" in session.said
+
+
+def test_the_violation_in_the_documentation_is_a_real_one():
+    with InprocessRig(RigOptions(record_directory=Path())) as rig:
+        bench = Bench(rig)
+        bench.run(0.05)
+        bench.delay("PositionFeedback", 0.0012)
+        bench.run(0.05)
+        with pytest.raises(AssertionError) as error:
+            bench.check_timing(TimingLimits(feedback_age_us=450, latency_us=900))
+    assert f"{error.value}\n" in code_blocks("text")
+
+
+# the acceptance scenarios
+
+
+@pytest.mark.long
+def test_every_scenario_is_the_same_to_the_last_bit_in_both_virtual_modes(tmp_path):
+    runs = []
+    for mode in ("inprocess", "lockstep"):
+        folder = tmp_path / mode
+        folder.mkdir()
+        out = [f"--hil-out={folder}", f"--junitxml={folder}/junit.xml"]
+        session = run_pytest(folder, "tests/scenarios", f"--hil-mode={mode}", *out, cwd=ROOT)
+        assert session.code == 0, session.said
+        runs.append(
+            {
+                name: [value for key, value in properties if key == "bus_sha256"]
+                for name, properties in session.properties().items()
+            }
+        )
+    assert sum(map(bool, runs[0].values())) >= 32
+    assert runs[0] == runs[1]

@@ -1,0 +1,98 @@
+"""What the acceptance scenarios share: how a scenario is played, and how a reaction is measured."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.state_machine import State
+from hil.bench import Bench
+from hil.scenario import load_scenario
+from hil.signals import Series
+
+FOLDER = Path(__file__).parent
+TABLE: dict[str, Any] = tomllib.loads((FOLDER / "requirements.toml").read_text(encoding="utf-8"))
+
+PERIOD_S = 1e-3
+MOTOR_RAMP_RPM_S = 4000.0 * 30.0 / np.pi
+MOTOR_LAG_S = 0.040
+"""For the motor's first-order lag of 5 ms to fall from 3000 rpm to 1 rpm."""
+AT_REST_RPM = 1.0
+
+CRUISE_FROM_M = 0.1
+CRUISE_M_S = 0.05
+CRUISE_BEGIN_S = 0.5
+"""Time by which the start of the move is over."""
+
+_SETTLING_PERIODS = 100
+
+
+def cruise(time_s: np.ndarray) -> np.ndarray:
+    """An even lift, in m."""
+    return CRUISE_FROM_M + CRUISE_M_S * time_s
+
+
+def play(bench: Bench, name: str) -> None:
+    """Play a built-in scenario in full."""
+    scenario = load_scenario(name)
+    bench.setpoint(scenario.position_m)
+    for time_s, force_n in scenario.load:
+        bench.run(time_s - bench.time_s)
+        bench.load_force(force_n)
+    bench.run(scenario.duration_s - bench.time_s)
+
+
+def hold_here(bench: Bench) -> None:
+    """Take the present position for the setpoint."""
+    bench.setpoint(bench.position_mm.last * 1e-3)
+
+
+def undisturbed(bench: Bench, series: Series) -> Series:
+    """Return a series by control period without the 100 ms after a period that the machine overran.
+
+    In virtual time there are none. If less than half of the periods are left, the run says nothing.
+    """
+    timing = bench.timing
+    overrun = {*timing.missed_periods.period.tolist(), *timing.late_periods.period.tolist()}
+    for age in (timing.feedback_age_us, timing.setpoint_age_us):
+        overrun |= set(age.period[~(age.values < 1000.0)].tolist())
+    period = np.rint(series.time_s / PERIOD_S)
+    keep = np.ones(len(series), bool)
+    for number in overrun:
+        keep &= (period < number) | (period >= number + _SETTLING_PERIODS)
+    assert keep.sum() >= len(series) / 2, f"inconclusive: periods {sorted(overrun)} were overrun"
+    return Series(series.time_s[keep], series.values[keep])
+
+
+def state_changes(bench: Bench) -> list[State]:
+    """Return the states the controller was in since time 0, one after the other."""
+    states = bench.trace["controller_state"]
+    states = states[np.isfinite(states)]
+    return [State(int(s)) for s in states[np.flatnonzero(np.diff(states, prepend=-1))]]
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What a moving machine did after something went wrong."""
+
+    safe_s: float
+    """Until the controller was in its safe state; NaN if it never was."""
+    at_rest_s: float
+    """Until the motor was at rest for good."""
+    ramp_s: float
+    """How long the drive's ramp takes from the speed that the motor had."""
+
+
+def reaction(bench: Bench, since_s: float) -> Reaction:
+    """Measure what happened since a time."""
+    states = Series(bench.trace["time_s"], bench.trace["controller_state"]).between(since_s)
+    speed = bench.motor_speed_rpm.between(since_s)
+    moving = np.flatnonzero(~(np.abs(speed.values) < AT_REST_RPM))
+    assert moving.size, "the motor was at rest before"
+    assert moving[-1] < len(speed) - 1, "the motor is still moving"
+    ramp_s = abs(speed.values[0]) / MOTOR_RAMP_RPM_S
+    return Reaction(
+        states.first(State.SAFE) - since_s, float(speed.time_s[moving[-1] + 1]) - since_s, float(ramp_s)
+    )
