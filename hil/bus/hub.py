@@ -234,9 +234,7 @@ class Hub:
                 self._greet(self._strangers.pop(key.fd))
             else:
                 self._take(key.fd)
-        log = self.wire.log
-        for participant, _ in self._participants.values():
-            participant.flush(log)
+        self._pass_on()
 
     def run_in_wall_time(
         self, keep_running: Callable[[], bool], clock_ns: Callable[[], int] = time.monotonic_ns
@@ -246,6 +244,7 @@ class Hub:
         self._catch_up = lambda: self.wire.run(clock_ns() - origin_ns)
         while keep_running():
             self._catch_up()
+            self._pass_on()  # what has just ended must not wait for what comes next
             next_ns = self.wire.next_event_ns()
             wait_s = _IDLE_POLL_S if next_ns >= NEVER else (next_ns - self.wire.now_ns) / 1e9
             self.service(min(max(wait_s, 0.0), _IDLE_POLL_S))
@@ -254,6 +253,12 @@ class Hub:
     def attach(self, name: str, clock: Clock | None = None) -> Port:
         """Put a node that has said hello onto the wire."""
         return self.wire.attach(self.nodes[name], clock)
+
+    def _pass_on(self) -> None:
+        """Send every participant what it has not got yet."""
+        log = self.wire.log
+        for participant, _ in self._participants.values():
+            participant.flush(log)
 
     def _flush_to_the_end(self) -> None:
         """Give listeners some time to take the rest; what they do not take is dropped."""
