@@ -754,3 +754,36 @@ def test_bus_time_in_wall_time_follows_the_clock_and_never_runs_ahead():
             receiver.recv(link.MAX_PACKET)
     duration_ns = (frame_bits(message()) - INTERMISSION_BITS) * 1000
     assert ends_ns == [turn_ns + duration_ns for turn_ns in turns_ns[:2]]
+
+
+def test_a_frame_that_has_ended_is_handed_over_before_the_hub_waits_for_anything_else(monkeypatch):
+    clock_ns = 0
+    heard_before_waiting = []
+    with (
+        Hub(Wire(1_000_000), "test", expected=None) as hub,
+        link.seqpacket_socket() as sender,
+        link.seqpacket_socket() as receiver,
+    ):
+        for end in (sender, receiver):
+            end.connect(os.fspath(link.socket_path("test")))
+            link.send_json(end, {"version": link.PROTOCOL_VERSION, "role": "bus"})
+            for _ in range(3):
+                hub.service()
+            assert link.receive_json(end)["virtual"] is False
+        serve = hub.service
+
+        def service(timeout_s: float) -> None:
+            heard_before_waiting.append(bool(select.select([receiver], [], [], 0)[0]))
+            serve(0.0)
+
+        def turns() -> Iterator[bool]:
+            nonlocal clock_ns
+            sender.send(link.pack_frame(Frame(0x123, 3, 0x030201)))
+            yield True
+            clock_ns = 1_000_000
+            yield True
+            yield False
+
+        monkeypatch.setattr(hub, "service", service)
+        hub.run_in_wall_time(turns().__next__, lambda: clock_ns)
+    assert heard_before_waiting == [False, True]
