@@ -9,6 +9,7 @@ import sys
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from bench_runs import SAFETY_NET_S
@@ -103,16 +104,15 @@ class Session:
 
 
 def run_pytest(folder: Path, *arguments: str, cwd: Path | None = None) -> Session:
-    sockets = folder / "sockets"
-    sockets.mkdir(exist_ok=True, mode=0o700)
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--color=no", *arguments],
-        cwd=cwd or folder,
-        capture_output=True,
-        text=True,
-        timeout=10 * SAFETY_NET_S,
-        env=os.environ | {"XDG_RUNTIME_DIR": str(sockets), "PYTEST_ADDOPTS": "", "COLUMNS": "240"},
-    )
+    with TemporaryDirectory() as sockets:  # a short path: a socket's has at most 107 characters
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--color=no", *arguments],
+            cwd=cwd or folder,
+            capture_output=True,
+            text=True,
+            timeout=10 * SAFETY_NET_S,
+            env=os.environ | {"XDG_RUNTIME_DIR": sockets, "PYTEST_ADDOPTS": "", "COLUMNS": "240"},
+        )
     return Session(folder, done.returncode, done.stdout + done.stderr)
 
 
