@@ -49,6 +49,11 @@ def hold_here(bench: Bench) -> None:
     bench.setpoint(bench.position_mm.last * 1e-3)
 
 
+def faults(bench: Bench) -> set[str]:
+    """Names of the controller's faults; without overruns in real time, where a stall makes some."""
+    return bench.controller_faults - ({"MailboxOverrun"} if bench.mode == "realtime" else set())
+
+
 def undisturbed(bench: Bench, series: Series) -> Series:
     """Return a series by control period without the 100 ms after a period that the machine overran.
 

@@ -1,7 +1,16 @@
 """Enable, disable, recover, restart."""
 
 import pytest
-from acceptance import AT_REST_RPM, MOTOR_LAG_S, cruise, hold_here, reaction, state_changes, undisturbed
+from acceptance import (
+    AT_REST_RPM,
+    MOTOR_LAG_S,
+    cruise,
+    faults,
+    hold_here,
+    reaction,
+    state_changes,
+    undisturbed,
+)
 
 from firmware_py.state_machine import State
 from hil.references import sine
@@ -30,7 +39,7 @@ def test_disabling_stops_the_motor(bench):
     bench.run(0.25)
     assert at_rest(bench, since_s=0.4)
     assert bench.controller_state == State.STANDBY
-    assert bench.controller_faults == set()
+    assert faults(bench) == set()
 
 
 @pytest.mark.bench(position_m=0.1)
@@ -61,7 +70,7 @@ def test_without_setpoints_it_is_in_the_safe_state(bench):
     bench.silence("PositionSetpoint")
     bench.run(0.25)
     assert bench.controller_state == State.SAFE
-    assert bench.controller_faults == {"SetpointLost"}
+    assert faults(bench) == {"SetpointLost"}
     assert at_rest(bench, since_s=0.4)
 
 
@@ -71,7 +80,7 @@ def test_without_mode_commands_it_is_in_the_safe_state(bench):
     bench.silence("ControllerCommand")
     bench.run(0.5)
     assert bench.controller_state == State.SAFE
-    assert bench.controller_faults == {"CommandLost"}
+    assert faults(bench) == {"CommandLost"}
     assert at_rest(bench, since_s=0.45)
 
 
@@ -86,7 +95,7 @@ def test_it_recovers_from_the_safe_state(bench):
     bench.enable()
     bench.run(0.35)
     assert bench.controller_state == State.RUN
-    assert bench.controller_faults == set()
+    assert faults(bench) == set()
     assert undisturbed(bench, bench.error_mm.between(0.4)).max < 0.2
 
 
@@ -104,7 +113,7 @@ def test_a_new_run_begins_where_it_is_told_to(bench_at):
     second = bench_at(position_m=0.2)
     second.run(0.25)
     assert second.controller_state == State.RUN
-    assert second.controller_faults == set()
+    assert faults(second) == set()
     assert undisturbed(second, second.position_mm.between(0.2)).last == pytest.approx(200.0, abs=0.2)
 
 
