@@ -111,7 +111,7 @@ def test_a_new_run_begins_where_it_is_told_to(bench_at):
     first.setpoint(lambda time_s: 0.05 + 0.05 * time_s)
     first.run(0.15)
     second = bench_at(position_m=0.2)
-    second.run(0.25)
+    second.run(0.4)
     assert second.controller_state == State.RUN
     assert faults(second) == set()
     assert undisturbed(second, second.position_mm.between(0.2)).last == pytest.approx(200.0, abs=0.2)
