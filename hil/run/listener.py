@@ -10,7 +10,7 @@ import can
 import numpy as np
 
 from hil.bus.messages import to_frame
-from hil.run.realtime import fifo_scheduling, shared_ns
+from hil.run.realtime import shared_ns
 
 _POLL_S = 0.05
 
@@ -18,8 +18,8 @@ _POLL_S = 0.05
 class Listener:
     """Logs a bus from a thread of its own.
 
-    The thread has the priority of the nodes: one of ordinary priority would keep the interpreter from the
-    supervisor for as long as other programs keep it from the processor.
+    The thread has ordinary priority: two threads under SCHED_FIFO that wait for the interpreter would leave a
+    single processor no time for the one that has it.
 
     Parameters
     ----------
@@ -69,11 +69,10 @@ class Listener:
 
     def _run(self) -> None:
         try:
-            with fifo_scheduling():
-                while not self._stopping:
-                    message = self._bus.recv(_POLL_S)
-                    if message is not None:
-                        self._take(message)
+            while not self._stopping:
+                message = self._bus.recv(_POLL_S)
+                if message is not None:
+                    self._take(message)
         except (can.CanError, OSError) as error:
             self.raised = error
 

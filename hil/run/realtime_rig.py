@@ -118,10 +118,6 @@ class RealtimeRig:
         self.processes.wait()
         return self.processes.failure()
 
-    def _end_session(self) -> None:
-        if self._session is not None:
-            self._session.end()
-
     def check(self) -> None:
         """Make sure that what was started here lives, and that the bus is heard.
 
@@ -133,6 +129,10 @@ class RealtimeRig:
         self.processes.check()
         if self.listener.raised is not None:
             raise BenchError(str(self.listener.raised))
+
+    def _end_session(self) -> None:
+        if self._session is not None:
+            self._session.end()
 
     def _wait_for_both_sides(self, timeout_s: float) -> None:
         """Wait until both sides are heard from now on, and make sure that they keep our time."""

@@ -15,8 +15,8 @@ import pytest
 from bench_runs import SAFETY_NET_S, background, busy_machine
 
 CHANNEL = "bench"
-RT_RATIO = "0.02"
-"""Three missed periods are 150 ms of wall time."""
+RT_RATIO = "0.03"
+"""Three missed periods are 100 ms of wall time."""
 
 SCENARIOS = """
 import pytest
