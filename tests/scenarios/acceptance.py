@@ -28,6 +28,12 @@ CRUISE_BEGIN_S = 0.5
 
 _SETTLING_PERIODS = 100
 _OVERRUN_AGE_US = 2000.0
+_STALE_PERIODS = 3
+_STALE_AGE_US = _STALE_PERIODS * 1000.0
+
+
+class InconclusiveError(Exception):
+    """In real time the machine stalled so that the run says nothing about the controller."""
 
 
 def cruise(time_s: np.ndarray) -> np.ndarray:
@@ -69,8 +75,20 @@ def undisturbed(bench: Bench, series: Series) -> Series:
     keep = np.ones(len(series), bool)
     for number in overrun:
         keep &= (period < number) | (period >= number + _SETTLING_PERIODS)
-    assert keep.sum() >= len(series) / 2, f"inconclusive: periods {sorted(overrun)} were overrun"
+    if keep.sum() < len(series) / 2:
+        raise InconclusiveError(f"periods {sorted(overrun)} were overrun")
     return Series(series.time_s[keep], series.values[keep])
+
+
+def stall(bench: Bench) -> str:
+    """Say which stall of the machine justifies that a side stopped in real time, or nothing."""
+    timing = bench.timing
+    for name, age in (("feedback", timing.feedback_age_us), ("setpoint", timing.setpoint_age_us)):
+        if age.max >= _STALE_AGE_US:
+            return f"the {name} was {age.max / 1e3:.1f} periods old"
+    if len(timing.missed_periods) >= _STALE_PERIODS:
+        return f"the commands of {len(timing.missed_periods)} periods were missed"
+    return ""
 
 
 def state_changes(bench: Bench) -> list[State]:

@@ -3,9 +3,12 @@
 from collections.abc import Callable, Generator
 
 import pytest
-from acceptance import CRUISE_BEGIN_S, CRUISE_FROM_M, FOLDER, TABLE, cruise
+from acceptance import CRUISE_BEGIN_S, CRUISE_FROM_M, FOLDER, TABLE, InconclusiveError, cruise, stall
 
 from hil.bench import Bench
+
+RUNS_AGAIN = 3
+"""How often a real-time scenario is run again whose run was inconclusive; a verdict is never run again."""
 
 REQUIREMENT_OF = {row["test"]: row["id"] for row in TABLE["requirement"]}
 
@@ -19,7 +22,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> Generator[None, N
             if requirement is None:
                 raise pytest.UsageError(f"{item.nodeid} is not in requirements.toml: add its requirement")
             item.user_properties.append(("requirement", requirement))
+            if item.config.getoption("hil_mode") == "realtime":
+                item.add_marker(pytest.mark.flaky(reruns=RUNS_AGAIN, only_rerun="InconclusiveError"))
     return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    """Call a failure in real time inconclusive if the bus log shows the stall that explains it."""
+    try:
+        return (yield)
+    except AssertionError as error:
+        benches = getattr(item, "funcargs", {}).get("_benches", [])
+        if benches and benches[-1].mode == "realtime" and (why := stall(benches[-1])):
+            raise InconclusiveError(f"{why}: {error}") from error
+        raise
 
 
 @pytest.fixture
