@@ -60,6 +60,20 @@ class Contract:
         codecs.sort(key=lambda codec: codec.can_id)
         self.messages: tuple[MessageCodec[..., Any], ...] = tuple(codecs)
 
+    def message(self, name: str) -> MessageCodec[..., Any]:
+        """Return a message by its name in the DBC.
+
+        Raises
+        ------
+        ValueError
+            If there is none of that name.
+        """
+        for message in self.messages:
+            if message.name == name:
+                return message
+        known = ", ".join(message.name for message in self.messages)
+        raise ValueError(f"there is no message {name!r}: choose one of {known}")
+
     @classmethod
     def load(cls, path: Path | None = None) -> Self:
         """Parse a DBC file and check it against `dbc.messages`.

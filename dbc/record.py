@@ -39,7 +39,8 @@ class Record:
 
     def columns_by_name(self) -> dict[str, np.ndarray]:
         """Return each column as an array of the number of rows."""
-        table = np.array(self._cells).reshape(-1, len(self.columns))
+        cells = self._cells.tobytes()  # in one step: another thread may be appending
+        table = np.frombuffer(cells, self._cells.typecode).reshape(-1, len(self.columns))
         return dict(zip(self.columns, table.T, strict=True))
 
     def save(self, path: Path) -> None:

@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
-from hil.bus.wire import FrameFault, Wire
+from hil.bus.wire import FrameFault, Port, Wire
 from hil.measure import M_TO_MM, Trace, figures_of, timing_in, trace_of
 from hil.report import OutputDirectory
-from hil.run.options import BenchError, Recording
+from hil.run.options import SIDES, BenchError, Recording
 from hil.run.rig import Rig
 from hil.scenario import PERIOD_S, TimingLimits
 from hil.signals import Series, signal_of
@@ -59,6 +58,7 @@ class Bench:
         self._period = BRING_UP_PERIODS
         self._recording: Recording | None = None
         self._trace: Trace | None = None
+        self._timing: Timing | None = None
         self._go_on()
 
     # commands
@@ -89,16 +89,17 @@ class Bench:
 
     def recover(self) -> None:
         """Ask to leave the safe state: withdraw the enable, reset the fault; takes 60 ms of `run`."""
+        begin = max(self._period, self._supervisor.next_period)
         for periods, words in RECOVERY_STEPS:
-            self._supervisor.plan(self._period + periods, **words)
+            self._supervisor.plan(begin + periods, **words)
 
     def silence(self, *messages: str) -> None:
         """Hold back messages of the supervisor, e.g. PositionSetpoint."""
-        self._supervisor.silent |= {self._codec(name).can_id for name in messages}
+        self._supervisor.silent |= {self._contract.message(name).can_id for name in messages}
 
     def unsilence(self, *messages: str) -> None:
         """Send them again."""
-        self._supervisor.silent -= {self._codec(name).can_id for name in messages}
+        self._supervisor.silent -= {self._contract.message(name).can_id for name in messages}
 
     def run(self, duration_s: float) -> None:
         """Go on.
@@ -119,10 +120,15 @@ class Bench:
 
     def corrupt(self, message: str, bit: int, count: int = 1) -> None:
         """Flip a payload bit of the next frames of a message, behind CAN's own CRC."""
+        bits = 8 * self._contract.message(message).dlc
+        if not 0 <= bit < bits:
+            raise ValueError(f"{message} has bits 0 to {bits - 1}, not {bit}")
         self._spoil(message, FrameFault.CORRUPT, 1 << bit, count)
 
     def delay(self, message: str, delay_s: float, count: int = 1) -> None:
         """Hand the next frames of a message over later; what follows may overtake them."""
+        if delay_s < 0:
+            raise ValueError(f"a frame cannot be early: delay_s is {delay_s}")
         self._spoil(message, FrameFault.DELAY, round(delay_s * 1e9), count)
 
     def repeat(self, message: str, count: int = 1) -> None:
@@ -131,11 +137,11 @@ class Bench:
 
     def power_off(self, node: str) -> None:
         """Cut "plant" or "controller" off."""
-        self._wire("power_off").detach(self._session.ports[node])
+        self._wire("power_off").detach(self._port(node))
 
     def power_on(self, node: str) -> None:
         """Start a node anew that was cut off, or reset one that was not."""
-        wire, port = self._wire("power_on"), self._session.ports[node]
+        wire, port = self._wire("power_on"), self._port(node)
         wire.reconnect(port)
         wire.start(port)
 
@@ -184,7 +190,9 @@ class Bench:
     @property
     def timing(self) -> Timing:
         """Timing of every control period since time 0."""
-        return timing_in(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
+        if self._timing is None:
+            self._timing = timing_in(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
+        return self._timing
 
     def check_timing(self, limits: TimingLimits) -> None:
         """Make sure that every control period met its limits.
@@ -211,7 +219,7 @@ class Bench:
             faults = Fault(0 if np.isnan(bits) else int(bits))
             names = [str(fault.name) for fault in Fault if fault in faults]
             return {"".join(part.capitalize() for part in name.split("_")) for name in names}
-        signals = self._codec("ControllerStatus").signals
+        signals = self._contract.message("ControllerStatus").signals
         flags = [name for name, signal in signals.items() if signal.length == 1]
         return {name for name in flags if self.signal(f"ControllerStatus.{name}").last == 1}
 
@@ -241,7 +249,9 @@ class Bench:
 
     def result(self, name: str) -> dict[str, Any]:
         """Return the figures so far, under the name of a test."""
-        figures = figures_of(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
+        figures = figures_of(
+            self.recording, self.trace, self.timing, self._contract, self.bit_rate, self.mode
+        )
         return {"scenario": name, "controller": self.controller, **figures, "paper": None}
 
     def write(self, folder: Path, name: str) -> list[Path]:
@@ -254,7 +264,7 @@ class Bench:
         self._session.end()
 
     def _go_on(self) -> None:
-        self._recording = self._trace = None
+        self._recording = self._trace = self._timing = None
         if not self._session.ending:
             self._session.run_to(self._period)
         if self._session.ending:
@@ -269,16 +279,18 @@ class Bench:
         return self.signal(signal).last
 
     def _spoil(self, message: str, fault: FrameFault, argument: int, count: int) -> None:
-        self._wire(fault.name.lower()).spoil(self._codec(message).can_id, fault, argument, count)
+        if count < 1:
+            raise ValueError(f"count is {count}, must be 1 or more")
+        can_id = self._contract.message(message).can_id
+        self._wire(fault.name.lower()).spoil(can_id, fault, argument, count)
+
+    def _port(self, node: str) -> Port:
+        if node not in SIDES:
+            raise ValueError(f"there is no node {node!r}: choose one of {', '.join(sorted(SIDES))}")
+        return self._session.ports[node]
 
     def _wire(self, what: str) -> Wire:
         wire = self._session.wire
         if wire is None:
             raise BenchError(f"{what} needs virtual time: use --hil-mode inprocess or lockstep")
         return wire
-
-    def _codec(self, name: str) -> MessageCodec[..., Any]:
-        for message in self._contract.messages:
-            if message.name == name:
-                return message
-        raise ValueError(f"there is no message {name!r}")

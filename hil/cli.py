@@ -33,6 +33,7 @@ from hil.run.options import (
     BenchError,
     InterruptedRunError,
     RunOptions,
+    check_bit_rate,
 )
 from hil.run.realtime_rig import run_realtime
 from hil.run.stopping import StopFlag, orphaned
@@ -130,15 +131,10 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _check_bit_rate(bit_rate: int) -> None:
-    if not 10_000 <= bit_rate <= 1_000_000:
-        raise BenchError(f"bit rate {bit_rate} is not from 10000 to 1000000 bit/s")
-
-
 def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
     if arguments.bitrate is not None:
-        _check_bit_rate(arguments.bitrate)
+        check_bit_rate(arguments.bitrate)
     bus = arguments.interface, arguments.channel, arguments.bitrate
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
@@ -230,7 +226,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _bus(arguments: argparse.Namespace) -> int:
-    _check_bit_rate(arguments.bitrate)
+    check_bit_rate(arguments.bitrate)
     stopped = StopFlag.on_signals()
 
     def keep_running() -> bool:

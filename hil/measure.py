@@ -102,7 +102,7 @@ def _by_period(rows: int, period: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def figures_of(
-    recording: Recording, trace: Trace, contract: Contract, bit_rate: int, mode: str
+    recording: Recording, trace: Trace, timing: Timing, contract: Contract, bit_rate: int, mode: str
 ) -> dict[str, Any]:
     """Return what was measured in a run.
 
@@ -121,7 +121,7 @@ def figures_of(
         "chatter_rpm_per_period": _finite(Series(trace["time_s"][1:], speed_steps_rpm).rms),
         "bit_rate": bit_rate,
         "bus_load_percent": bus_load_percent(recording, contract, bit_rate),
-        "timing": timing_in(recording, trace, contract, bit_rate, mode).summary(),
+        "timing": timing.summary(),
         "bus_frames": len(recording.traffic),
         "bus_sha256": hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest(),
         "scenario_start_bus_s": recording.start_ns / 1e9,
@@ -138,11 +138,11 @@ def result_of(
 ) -> dict[str, Any]:
     """Return a scenario's figures and the verdict on them, as written to ``result.json``."""
     scenario, bit_rate = options.scenario, options.wire_bit_rate
-    figures = figures_of(recording, trace, contract, bit_rate, mode)
+    timing = timing_in(recording, trace, contract, bit_rate, mode)
+    figures = figures_of(recording, trace, timing, contract, bit_rate, mode)
     limits = scenario.limits.get(options.controller)
     within, verdict = None, ""
     if not recording.ending:
-        timing = timing_in(recording, trace, contract, bit_rate, mode)
         tracking = _tracking_within(limits, figures["rms_mm"], figures["max_mm"])
         within, verdict = _judged(trace, limits, tracking, timing, scenario.timing)
     return {
@@ -229,6 +229,8 @@ def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: 
 
 def _first_period(recording: Recording) -> int:
     """Periods that were played before the scenario's first one."""
+    if not len(recording.supervisor["time_ns"]):
+        return 0
     return round((recording.start_ns - int(recording.supervisor["time_ns"][0])) / PERIOD_NS)
 
 

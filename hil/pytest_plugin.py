@@ -91,7 +91,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     has = CAPABILITIES.get(interface_of(config), _OTHER_ADAPTER)
     lacking: Counter[str] = Counter()
     out = []
-    for item in items:
+    for item in filter(_has_bench, items):
         needs = [need for marker in item.iter_markers("needs") for need in marker.args]
         if unknown := [need for need in needs if not any(need in all_ for all_ in CAPABILITIES.values())]:
             raise pytest.UsageError(f"{item.nodeid}: nothing has {unknown[0]!r}")
@@ -101,7 +101,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.stash[_not_applicable] = lacking
     config.hook.pytest_deselected(items=out)
     items[:] = [item for item in items if item not in out]
-    config.stash[_applicable] = sum("_benches" in getattr(item, "fixturenames", ()) for item in items)
+    config.stash[_applicable] = sum(map(_has_bench, items))
+
+
+def _has_bench(item: pytest.Item) -> bool:
+    return "_benches" in getattr(item, "fixturenames", ())
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
@@ -123,15 +127,23 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Note the figures of the benches a test had; of a failing one leave the folder and say how to replay."""
     benches: list[Bench] = getattr(item, "funcargs", {}).get("_benches", [])
-    results = [bench.result(item.name) for bench in benches] if call.when == "call" else []
-    for result in results:
-        item.user_properties.append(("bench", result["mode"]))
-        item.user_properties.extend(_properties(result))
+    if call.when != "call" or not benches:
+        return (yield)
+    trouble = ""
+    try:
+        for bench in benches:
+            item.user_properties.append(("bench", bench.mode))
+            item.user_properties.extend(_properties(bench.result(item.name)))
+    except Exception as error:  # a test's own verdict counts, not what its figures suffer from
+        trouble = f"no figures ({error})\n"
     report = yield
-    if call.when == "call" and report.failed and benches:
-        folders = [str(_leave(item, bench, number)) for number, bench in enumerate(benches)]
-        text = f"results in {', '.join(folders)}\nreplay: {_replay_command(item)}"
-        report.sections.append(("bench", text))
+    if report.failed:
+        try:
+            folders = [str(_leave(item, bench, number)) for number, bench in enumerate(benches)]
+            trouble += f"results in {', '.join(folders)}"
+        except Exception as error:
+            trouble += f"no results could be left ({error})"
+        report.sections.append(("bench", f"{trouble}\nreplay: {_replay_command(item)}"))
     return report
 
 
@@ -142,13 +154,14 @@ def hil_rig(
     """Return what gives the rig of this test session; one that has lost a process is replaced."""
     import can
 
+    from hil.bus.link import LinkError
     from hil.run.options import BenchError
     from hil.run.rig import RigKeeper
 
     def rig() -> "Rig":
         try:
             return keeper.rig()
-        except (BenchError, can.CanInitializationError) as error:
+        except (BenchError, LinkError, can.CanInitializationError) as error:
             pytest.exit(f"hil: {error}", returncode=2)
 
     with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
@@ -186,14 +199,11 @@ def bench(request: pytest.FixtureRequest, bench_at: "Callable[..., Bench]") -> "
 
 
 def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
-    import can
-
-    from hil.bus.link import LinkError
     from hil.bus.opening import bus_settings
     from hil.run.inprocess import InprocessRig
     from hil.run.lockstep import LockstepRig
     from hil.run.options import SIDES as BOTH
-    from hil.run.options import BenchError, RigOptions
+    from hil.run.options import RigOptions
     from hil.run.realtime_rig import RealtimeRig
 
     interface, channel = config.getoption("hil_interface"), config.getoption("hil_channel")
@@ -204,21 +214,18 @@ def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
         "lockstep": LockstepRig,
         "realtime": RealtimeRig,
     }
-    try:
-        if interface:
-            interface, channel, bit_rate = bus_settings(interface, channel, bit_rate)
-        options = RigOptions(
-            record_directory=directory,
-            bit_rate=bit_rate,
-            interface=interface,
-            channel=channel,
-            rt_ratio=_ratio(config),
-            started=frozenset(SIDES.get(start, BOTH)),
-            start_timeout_s=config.getoption("hil_start_timeout"),
-        )
-        return rigs[config.getoption("hil_mode")](options)
-    except (LinkError, can.CanInitializationError) as error:
-        raise BenchError(str(error)) from error
+    if interface:
+        interface, channel, bit_rate = bus_settings(interface, channel, bit_rate)
+    options = RigOptions(
+        record_directory=directory,
+        bit_rate=bit_rate,
+        interface=interface,
+        channel=channel,
+        rt_ratio=_ratio(config),
+        started=frozenset(SIDES.get(start, BOTH)),
+        start_timeout_s=config.getoption("hil_start_timeout"),
+    )
+    return rigs[config.getoption("hil_mode")](options)
 
 
 def _ratio(config: pytest.Config) -> Fraction:

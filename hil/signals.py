@@ -82,10 +82,7 @@ def signal_of(traffic: np.ndarray, contract: Contract, name: str, start_ns: int 
         If there is no such message or signal.
     """
     message_name, _, signal_name = name.partition(".")
-    message = next((message for message in contract.messages if message.name == message_name), None)
-    if message is None:
-        known = ", ".join(message.name for message in contract.messages)
-        raise ValueError(f"there is no message {message_name!r}: choose one of {known}")
+    message = contract.message(message_name)
     signal = message.signals.get(signal_name)
     if signal is None:
         raise ValueError(

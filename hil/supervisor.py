@@ -66,6 +66,8 @@ class Supervisor:
     latched: frozenset[int] = frozenset()
 
     def __init__(self, contract: Contract, controller: str, position_m: float = 0.0) -> None:
+        if controller not in CONTROLLERS:
+            raise ValueError(f"there is no controller {controller!r}: choose one of {', '.join(CONTROLLERS)}")
         self.record = Record(("time_ns", "reference_m", "setpoint_raw", "load_n"), "d")
         self.start_ns = 0
         self.next_period = 0
@@ -171,7 +173,8 @@ class Supervisor:
         if index >= len(self._chunk[0]):
             self._chunk_begin, index = period, 0
             elapsed = np.arange(period, period + _CHUNK) - self._reference_begin
-            reference_m = self._reference(elapsed * PERIOD_S)
+            time_s = elapsed * PERIOD_S
+            reference_m = np.broadcast_to(np.asarray(self._reference(time_s), float), time_s.shape)
             self._chunk = reference_m.tolist(), setpoint_counts(reference_m).tolist()
         return self._chunk[0][index], self._chunk[1][index]
 

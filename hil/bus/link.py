@@ -95,12 +95,6 @@ def pack_event(kind: int, now_ns: int = 0) -> bytes:
     return _EVENT.pack(kind, now_ns)
 
 
-def event_kind(packet: memoryview) -> int:
-    """Return what an event asks for."""
-    kind: int = _EVENT.unpack_from(packet)[0]
-    return kind
-
-
 def deliver(node: Node, packet: memoryview) -> Actions:
     """Call a node's entry points for an event and the frames that come with it; return its actions.
 

@@ -185,6 +185,7 @@ class Wire:
     def start(self, port: Port) -> None:
         """Power a node on now."""
         words = self._mail[port.order]
+        self._make_room()
         words[: at.FRAMES] = link.START, port.clock.local(self.now_ns)
         self._port_words[port.order, at.MAILED] = 0
         length = port.ask(port.packet[: at.FRAMES * 8], self._answer)
@@ -198,8 +199,7 @@ class Wire:
         sender : int
             A port's order; a number from `wire_core.MAX_PORTS` on for a sender that is no node.
         """
-        if self._core[at.QUEUED] == len(self._queue):
-            self._make_room()
+        self._make_room()
         can_id, dlc, data = frame
         head = can_id | dlc << 32
         _hand_over(

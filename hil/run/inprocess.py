@@ -12,7 +12,7 @@ from firmware_py.node import PHASE_NS, Controller
 from firmware_py.tuning import Tuning
 from hil.bus import link
 from hil.bus.wire import Clock, Port, Wire
-from hil.run.options import INTERRUPTED, Recording, RigOptions, RunOptions
+from hil.run.options import INTERRUPTED, Recording, RigOptions, RunOptions, check_bit_rate
 from hil.run.rig import play
 from hil.supervisor import Supervisor
 from plant_sim.node import Plant
@@ -60,7 +60,7 @@ class InprocessRig:
 
         return VirtualSession(
             self._options,
-            make_wire(self.contract, bit_rate or self.bit_rate),
+            make_wire(self.contract, self.bit_rate if bit_rate is None else bit_rate),
             Supervisor(self.contract, controller, position_m),
             [plant, firmware],
             records,
@@ -165,5 +165,6 @@ class VirtualSession:
 
 def make_wire(contract: Contract, bit_rate: int) -> Wire:
     """Return a wire on which the contract's bench channel is out of band."""
+    check_bit_rate(bit_rate)
     out_of_band = frozenset(message.can_id for message in contract.messages if message.bench_channel)
     return Wire(bit_rate, out_of_band)

@@ -73,7 +73,7 @@ class Listener:
                 message = self._bus.recv(_POLL_S)
                 if message is not None:
                     self._take(message)
-        except (can.CanError, OSError) as error:
+        except Exception as error:  # whatever a driver raises: the rig tells
             self.raised = error
 
     def _take(self, message: can.Message) -> None:

@@ -52,7 +52,7 @@ class LockstepRig:
     def __init__(self, options: RigOptions) -> None:
         self.contract = Contract.load(options.dbc)
         self.bit_rate = options.wire_bit_rate
-        self.broken = False
+        self._lost = False
         self._options = options
         self._begin_s = time.perf_counter()
         self._stack = ExitStack()
@@ -78,13 +78,26 @@ class LockstepRig:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    @property
+    def broken(self) -> bool:
+        """Whether a process was lost."""
+        return self._lost or self.processes.any_ended
+
+    def give_up(self) -> None:
+        """Begin no further session: a process was lost."""
+        self._lost = True
+
     def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "LockstepSession":
         """Begin a run; see `hil.run.rig.Rig`."""
-        wire = make_wire(self.contract, bit_rate or self.bit_rate)
+        wire = make_wire(self.contract, self.bit_rate if bit_rate is None else bit_rate)
         self.hub.lead_to(wire)
         for name in SIDES:
             forget_record(self._options, name)
-            self.hub.nodes[name].forget()
+            try:
+                self.hub.nodes[name].forget()
+            except NodeGoneError as error:
+                self.give_up()
+                raise BenchError(str(error)) from error
         return LockstepSession(self, wire, Supervisor(self.contract, controller, position_m), self._begin_s)
 
     def finish(self) -> str:
@@ -139,7 +152,8 @@ class LockstepSession(VirtualSession):
 
     def _lose(self, gone: NodeGoneError) -> None:
         """Let the others go on for a while, so that their reaction is on record, and say what happened."""
-        self.broken = self._rig.broken = True
+        self.broken = True
+        self._rig.give_up()
         gone_ns = self.wire.now_ns
         at = f"{gone} at bus time {gone_ns / 1e9:.3f} s"
         processes = self._rig.processes

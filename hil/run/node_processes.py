@@ -9,6 +9,7 @@ import signal
 import stat
 import sys
 import time
+import traceback
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,12 @@ def _be_side(name: str, arguments: list[str], log: Path) -> None:
         for descriptor, stream in enumerate((nothing, nothing, words)):
             os.dup2(stream.fileno(), descriptor)
         sys.stdin, sys.stdout, sys.stderr = nothing, nothing, words
-        sys.exit(importlib.import_module(f"{MODULES[name]}.__main__").main(arguments))
+        try:
+            code = importlib.import_module(f"{MODULES[name]}.__main__").main(arguments)
+        except Exception:
+            traceback.print_exc()
+            code = 1
+        sys.exit(code)
 
 
 def _close_sockets() -> None:
@@ -96,6 +102,11 @@ class NodeProcesses:
     def pids(self) -> list[int]:
         """Process ids."""
         return [process.pid for process in self._processes.values() if process.pid is not None]
+
+    @property
+    def any_ended(self) -> bool:
+        """Whether a process that was started has ended."""
+        return any(process.exitcode is not None for process in self._processes.values())
 
     def check(self) -> None:
         """Make sure that both are alive.

@@ -29,6 +29,18 @@ class InterruptedRunError(BenchError):
     """The run was asked to stop before it began."""
 
 
+def check_bit_rate(bit_rate: int) -> None:
+    """Refuse a bit rate that classic CAN has not.
+
+    Raises
+    ------
+    BenchError
+        If it is not from 10 kbit/s to 1 Mbit/s.
+    """
+    if not 10_000 <= bit_rate <= 1_000_000:
+        raise BenchError(f"bit rate {bit_rate} is not from 10000 to 1000000 bit/s")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigOptions:
     """What a bench is made of.
@@ -64,6 +76,9 @@ class RigOptions:
     start_timeout_s: float = 120.0
     answer_timeout_s: float = 10.0
     stopped: StopFlag = field(default_factory=StopFlag)
+
+    def __post_init__(self) -> None:
+        check_bit_rate(self.wire_bit_rate if self.bit_rate is None else self.bit_rate)
 
     @property
     def wire_bit_rate(self) -> int:

@@ -11,8 +11,6 @@ from statistics import median
 from threading import Thread
 from typing import Self
 
-import can
-
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from hil.bus.opening import BusSettings, bus_settings, open_bus
@@ -99,7 +97,7 @@ class RealtimeRig:
     @property
     def broken(self) -> bool:
         """Whether a process was lost."""
-        return self._session is not None and self._session.broken
+        return self.processes.any_ended or (self._session is not None and self._session.broken)
 
     def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "RealtimeSession":
         """Begin a run; see `hil.run.rig.Rig`."""
@@ -241,7 +239,7 @@ class RealtimeSession:
 
     def end(self) -> None:
         """Withdraw the enable, then stop; idempotent."""
-        if self._thread.is_alive() and not self.ending:
+        if self._thread.is_alive() and not self.broken:
             self.supervisor.steer(enable=0)
             self._goodbye = self.supervisor.next_period + _GOODBYE_PERIODS
             self._thread.join()
@@ -256,7 +254,7 @@ class RealtimeSession:
         try:
             self._runner.start()
             self._runner.run(self._keep_running)
-        except (can.CanError, OSError) as error:
+        except Exception as error:  # of the bus or of a user's reference: `run_to` tells
             self._raised = error
 
     def _keep_running(self) -> bool:
@@ -268,7 +266,7 @@ class RealtimeSession:
         """See whether something has ended the run."""
         try:
             if self._raised is not None:
-                raise BenchError(str(self._raised))
+                raise BenchError(f"{type(self._raised).__name__}: {self._raised}")
             self._rig.check()
         except BenchError as error:
             self.ending, self.broken = str(error), True
@@ -285,19 +283,20 @@ def _bus_to_use(options: RigOptions) -> Iterator[BusSettings]:
     channel = options.channel or f"run-{os.getpid()}"
     bit_rate = options.wire_bit_rate
     command = [sys.executable, "-m", "hil", "bus", "--channel", channel, "--bitrate", str(bit_rate)]
-    hub = subprocess.Popen(
+    with subprocess.Popen(
         [*command, "--parent", str(os.getpid())],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
-    )
-    try:
-        assert hub.stdout is not None
-        said = hub.stdout.readline().decode(errors="replace").strip()
-        if not said.startswith(HUB_GREETING):
-            raise BenchError(said.removeprefix("hil: "))
-        yield BusSettings("hilbus", channel, bit_rate)
-    finally:
-        hub.terminate()
-        hub.wait()
+        text=True,
+    ) as hub:
+        try:
+            assert hub.stdout is not None
+            said = hub.stdout.readline().strip()
+            if not said.startswith(HUB_GREETING):
+                last = (said, *hub.stdout.read().strip().splitlines())[-1]
+                raise BenchError(last.removeprefix("hil: ") or "the bus process ended silently")
+            yield BusSettings("hilbus", channel, bit_rate)
+        finally:
+            hub.terminate()

@@ -95,6 +95,7 @@ def play(rig: Rig, options: RunOptions) -> Recording:
         if session.ending:
             break
         options.progress(period * PERIOD_S)
+    session.end()
     failure = rig.finish()
     recording = session.recording()
     if failure and not recording.ending:

@@ -118,7 +118,7 @@ def test_after_a_loss_the_others_play_on_for_a_tenth_of_a_second_of_bus_time():
 
     lost_rig = SimpleNamespace(
         options=RigOptions(record_directory=Path()),
-        broken=False,
+        give_up=lambda: None,
         hub=SimpleNamespace(
             nodes={"plant": Dying("plant"), "controller": Dying("controller")}, service=lambda: None
         ),

@@ -74,6 +74,11 @@ def test_that_loses_it(bench):
     os.kill(firmware(), signal.SIGKILL)
     bench.run(0.02)
 
+def test_after_it(bench):
+    bench.run(0.02)
+    os.kill(firmware(), signal.SIGKILL)
+    os.waitid(os.P_PID, firmware(), os.WEXITED | os.WNOWAIT)  # dead between two tests
+
 def test_after(bench):
     bench.run(0.02)
     assert bench.controller_state == 2
@@ -216,7 +221,7 @@ def test_a_need_that_nothing_has_is_refused(tmp_path):
 def test_a_lost_process_fails_its_test_only(tmp_path):
     session = user_session(tmp_path, LOSES_ITS_FIRMWARE)
     assert session.code == 1
-    assert "1 failed, 2 passed" in session.said
+    assert "1 failed, 3 passed" in session.said
     said = r"FAILED test_user\.py::test_that_loses_it - .*BenchError: the controller process ended .*"
     assert [line for line in session.lines if re.fullmatch(said, line)], session.said
 
