@@ -13,10 +13,15 @@ from hil.measure import M_TO_MM, Trace, figures_of, timing_in, trace_of
 from hil.report import OutputDirectory
 from hil.run.options import SIDES, BenchError, Recording
 from hil.run.rig import Rig
-from hil.scenario import PERIOD_S, TimingLimits
+from hil.scenario import MAX_LOAD_N, PERIOD_S, TimingLimits
 from hil.signals import Series, signal_of
 from hil.supervisor import BRING_UP_PERIODS, Reference
 from hil.timing import Figure, Timing
+from plant_sim.parameters import PlantParameters
+
+STROKE_M = PlantParameters().stroke_m
+MAX_SETPOINT_M = 0.999
+"""Range of PositionSetpoint in the DBC, m."""
 
 RECOVERY_STEPS = ((0, {"enable": 0, "fault_reset": 0}), (3, {"fault_reset": 1}), (50, {"fault_reset": 0}))
 """Periods from now and mode commands that bring a controller from its safe state back to standby."""
@@ -49,6 +54,8 @@ class Bench:
     def __init__(
         self, rig: Rig, controller: str = "adrc", position_m: float = 0.0, bit_rate: int | None = None
     ) -> None:
+        if not 0.0 <= position_m <= STROKE_M:
+            raise ValueError(f"position_m is {position_m}, must be from 0 to {STROKE_M} m")
         self.mode = rig.mode
         self.bit_rate = bit_rate or rig.bit_rate
         self.controller = controller
@@ -69,6 +76,8 @@ class Bench:
             follow = reference
         else:
             position_m = float(reference)
+            if abs(position_m) > MAX_SETPOINT_M:
+                raise ValueError(f"a setpoint of {position_m} m is beyond {MAX_SETPOINT_M} m")
 
             def follow(time_s: np.ndarray) -> np.ndarray:
                 return np.full(len(time_s), position_m)
@@ -77,6 +86,8 @@ class Bench:
 
     def load_force(self, force_n: float) -> None:
         """Let a force act on the rod, N; positive resists extension."""
+        if abs(force_n) > MAX_LOAD_N:
+            raise ValueError(f"{force_n} N is beyond {MAX_LOAD_N:g} N")
         self._supervisor.plan(self._period, load_n=round(force_n))
 
     def enable(self) -> None:
@@ -109,7 +120,10 @@ class Bench:
         BenchError
             If a process was lost.
         """
-        self._period += round(duration_s / PERIOD_S)
+        periods = round(duration_s / PERIOD_S)
+        if periods < 1:
+            raise ValueError(f"duration_s is {duration_s}, must be one period of {PERIOD_S} s or more")
+        self._period += periods
         self._go_on()
 
     # what can go wrong, in virtual time

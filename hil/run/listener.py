@@ -28,12 +28,15 @@ class Listener:
 
     Attributes
     ----------
+    newest_ns : dict of int to int
+        When each id was heard last, ns of `time.monotonic_ns`.
     raised : Exception or None
         Why it hears no more.
     """
 
     def __init__(self, bus: can.BusABC) -> None:
         self.raised: Exception | None = None
+        self.newest_ns: dict[int, int] = {}
         self._bus = bus
         self._stopping = False
         self._heard: list[tuple[int, int, int, int, int]] = []  # heard, stamped (ns), id, dlc, data
@@ -78,4 +81,7 @@ class Listener:
 
     def _take(self, message: can.Message) -> None:
         if not (message.is_error_frame or message.is_remote_frame or message.is_fd):
-            self._heard.append((time.monotonic_ns(), round(message.timestamp * 1e9), *to_frame(message)))
+            frame = to_frame(message)
+            now_ns = time.monotonic_ns()
+            self.newest_ns[frame.can_id] = now_ns
+            self._heard.append((now_ns, round(message.timestamp * 1e9), *frame))

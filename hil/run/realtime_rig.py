@@ -33,6 +33,8 @@ from hil.supervisor import BRING_UP_PERIODS, Supervisor
 
 _POLL_S = 0.05
 _SHORTEST_WAIT_S, _LONGEST_WAIT_S = 0.001, 0.1
+_SILENT_PERIODS, _SILENT_S = 100, 2.0
+"""A side from which nothing is heard for as long as the longer of the two is lost."""
 _GOODBYE_PERIODS = 5
 _MEASURED_PERIODS = 10
 _SAME_RATIO = 1.5
@@ -127,6 +129,20 @@ class RealtimeRig:
         self.processes.check()
         if self.listener.raised is not None:
             raise BenchError(str(self.listener.raised))
+
+    def check_sides(self) -> None:
+        """Make sure that both sides are still heard.
+
+        Raises
+        ------
+        BenchError
+            Naming the one that has gone silent.
+        """
+        longest_s = max(_SILENT_PERIODS * PERIOD_NS / 1e9 / float(self.options.rt_ratio), _SILENT_S)
+        for side, can_id in self._beacons.items():
+            silent_s = (time.monotonic_ns() - self.listener.newest_ns[can_id]) / 1e9
+            if silent_s > longest_s:
+                raise BenchError(f"the {side} has been silent for {silent_s:.1f} s: does it still run?")
 
     def _end_session(self) -> None:
         if self._session is not None:
@@ -268,6 +284,7 @@ class RealtimeSession:
             if self._raised is not None:
                 raise BenchError(f"{type(self._raised).__name__}: {self._raised}")
             self._rig.check()
+            self._rig.check_sides()
         except BenchError as error:
             self.ending, self.broken = str(error), True
         if self._rig.options.stopped.is_set():

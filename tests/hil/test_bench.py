@@ -54,6 +54,10 @@ def test_a_reference_may_be_a_number_or_a_function_of_either(rig):
         (lambda bench: bench.corrupt("PositionFeedback", -1), "bits 0 to 47"),
         (lambda bench: bench.drop("PositionFeedback", 0), "count is 0"),
         (lambda bench: bench.delay("PositionFeedback", -0.001), "cannot be early"),
+        (lambda bench: bench.setpoint(200), "a setpoint of 200.0 m is beyond 0.999 m"),
+        (lambda bench: bench.load_force(1e9), "is beyond 1e"),
+        (lambda bench: bench.run(-1), "must be one period"),
+        (lambda bench: bench.run(0.0004), "must be one period"),
         (lambda bench: bench.drop("Position"), "there is no message 'Position': choose one of DriveCommand"),
         (lambda bench: bench.silence("Setpoint"), "there is no message 'Setpoint'"),
         (lambda bench: bench.signal("DriveStatus.Speed"), "DriveStatus has no signal 'Speed'"),
@@ -68,6 +72,8 @@ def test_what_does_not_exist_is_refused(rig, wrong, said):
 def test_an_unknown_controller_and_an_impossible_bit_rate_are_refused(rig):
     with pytest.raises(ValueError, match="there is no controller 'lqr': choose one of p, pi, adrc"):
         Bench(rig, controller="lqr")
+    with pytest.raises(ValueError, match="position_m is 5, must be from 0 to"):
+        Bench(rig, position_m=5)
     with pytest.raises(BenchError, match="bit rate -5 is not"):
         Bench(rig, bit_rate=-5)
     with pytest.raises(BenchError, match="bit rate 0 is not"):
