@@ -15,6 +15,7 @@ from hil.bus.wire_time import classic_bits
 from hil.run.options import Recording, RunOptions
 from hil.scenario import PERIOD_S, TimingLimits
 from hil.signals import Series, signal_of
+from hil.supervisor import BRING_UP_PERIODS
 from hil.timing import Timing, timing_of
 
 M_TO_MM = 1e3
@@ -69,7 +70,7 @@ def trace_of(recording: Recording, contract: Contract) -> Trace:
     trace : dict of ndarray
         One row per control period k = 0, 1, ... of the scenario that was played; NaN where there is none.
     """
-    rows = max(round(recording.simulated_s / PERIOD_S) - _first_period(recording), 0)
+    rows = max(round(recording.simulated_s / PERIOD_S) - BRING_UP_PERIODS, 0)
     signals = contract.observer_state.signals
     observer = tuple((name, source, signals[signal].factor) for name, source, signal in OBSERVER_COLUMNS)
     trace = {"time_s": np.arange(rows) * PERIOD_S}
@@ -225,13 +226,6 @@ def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: 
         recording.start_ns + periods * PERIOD_NS,
         None if controller is None else controller["time_ns"] + PHASE_NS,
     )
-
-
-def _first_period(recording: Recording) -> int:
-    """Periods that were played before the scenario's first one."""
-    if not len(recording.supervisor["time_ns"]):
-        return 0
-    return round((recording.start_ns - int(recording.supervisor["time_ns"][0])) / PERIOD_NS)
 
 
 def _finite(value: float) -> float | None:
