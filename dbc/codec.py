@@ -108,6 +108,11 @@ class MessageCodec(Generic[P, T]):
         return self.data_ids
 
 
+def signal_name(field: str) -> str:
+    """Return the DBC's name of a layout's field: `target_velocity` is `TargetVelocity`."""
+    return "".join(part.capitalize() for part in field.split("_"))
+
+
 @dataclass(frozen=True, slots=True)
 class FieldBits:
     """Where a field of a layout lies in the payload."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Self, TypeVar, get_type_hints
 
 from dbc import messages
-from dbc.codec import FieldBits, MessageCodec, Signal, generate_pack, generate_unpack
+from dbc.codec import FieldBits, MessageCodec, Signal, generate_pack, generate_unpack, signal_name
 from dbc.frame import EFF_FLAG
 from dbc.messages import Raw
 
@@ -162,8 +162,7 @@ class _Reader:
         return tuple(int(i) for i in ids)
 
     def _field_bits(self, message: "DbcMessage", field: str, encodings: tuple[Raw, ...]) -> FieldBits:
-        camel_case = "".join(part.capitalize() for part in field.split("_"))
-        signals = [self._signal(message, raw.signal or camel_case, raw) for raw in encodings]
+        signals = [self._signal(message, raw.signal or signal_name(field), raw) for raw in encodings]
         first, *others = signals
         for other in others:
             if other.start != first.start:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from dbc.codec import signal_name
 from dbc.contract import Contract
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
@@ -20,8 +21,6 @@ from hil.timing import Figure, Timing
 from plant_sim.parameters import PlantParameters
 
 STROKE_M = PlantParameters().stroke_m
-MAX_SETPOINT_M = 0.999
-"""Range of PositionSetpoint in the DBC, m."""
 
 RECOVERY_STEPS = ((0, {"enable": 0, "fault_reset": 0}), (3, {"fault_reset": 1}), (50, {"fault_reset": 0}))
 """Periods from now and mode commands that bring a controller from its safe state back to standby."""
@@ -76,8 +75,9 @@ class Bench:
             follow = reference
         else:
             position_m = float(reference)
-            if abs(position_m) > MAX_SETPOINT_M:
-                raise ValueError(f"a setpoint of {position_m} m is beyond {MAX_SETPOINT_M} m")
+            highest_m = self._contract.position_setpoint.signals["Position"].maximum
+            if highest_m is not None and abs(position_m) > highest_m:
+                raise ValueError(f"a setpoint of {position_m} m is beyond {highest_m} m")
 
             def follow(time_s: np.ndarray) -> np.ndarray:
                 return np.full(len(time_s), position_m)
@@ -230,9 +230,7 @@ class Bench:
         """Names of the controller's fault signals that are set; as up to date as `controller_state`."""
         if "controller_faults" in self.trace:
             bits = self._newest("controller_faults", "")
-            faults = Fault(0 if np.isnan(bits) else int(bits))
-            names = [str(fault.name) for fault in Fault if fault in faults]
-            return {"".join(part.capitalize() for part in name.split("_")) for name in names}
+            return {signal_name(str(fault.name)) for fault in Fault(0 if np.isnan(bits) else int(bits))}
         signals = self._contract.message("ControllerStatus").signals
         flags = [name for name, signal in signals.items() if signal.length == 1]
         return {name for name in flags if self.signal(f"ControllerStatus.{name}").last == 1}

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from dbc.contract import Contract, ContractError
+from dbc.contract import ContractError
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
@@ -24,8 +24,6 @@ from hil.bus.wire import Wire
 from hil.measure import result_of, trace_of
 from hil.report import OutputDirectory
 from hil.run.arguments import ratio
-from hil.run.inprocess import run_inprocess
-from hil.run.lockstep import run_lockstep
 from hil.run.options import (
     DEFAULT_BIT_RATE,
     HUB_GREETING,
@@ -35,7 +33,8 @@ from hil.run.options import (
     RunOptions,
     check_bit_rate,
 )
-from hil.run.realtime_rig import run_realtime
+from hil.run.rig import play
+from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
 from hil.supervisor import BRING_UP_S
@@ -44,7 +43,6 @@ EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
 EXIT_UNUSABLE = 1
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 
-MODES = {"lockstep": run_lockstep, "inprocess": run_inprocess, "realtime": run_realtime}
 EXIT_CODES = """exit codes: 0 played and within the scenario's limits; 1 played, limits missed;
 2 wrong input or no answer; 3 a process was lost; 130 interrupted"""
 
@@ -80,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
     run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
     run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
-    run.add_argument("--mode", choices=MODES, default="lockstep", help="default lockstep")
+    run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
     run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .trc ...")
@@ -160,10 +158,10 @@ def _run(arguments: argparse.Namespace) -> int:
                 progress=progress,
                 stopped=stopped,
             )
-            recording = MODES[arguments.mode](options)
-        contract = Contract.load(arguments.dbc)
-        trace = trace_of(recording, contract)
-        result = result_of(recording, trace, contract, options, arguments.mode)
+            with RIGS[arguments.mode](options) as rig:
+                recording = play(rig, options)
+        trace = trace_of(recording, rig.contract)
+        result = result_of(recording, trace, rig.contract, options, rig.mode)
         files = folder.write(result, trace, recording.traffic)
     if arguments.json:
         print(json.dumps(result, indent=2))

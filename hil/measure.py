@@ -11,7 +11,7 @@ from dbc.node import PERIOD_NS
 from firmware_py.node import PHASE_NS
 from firmware_py.state_machine import State
 from firmware_py.task import Fault
-from hil.bus.wire_time import classic_bits
+from hil.bus.wire_time import traffic_bits
 from hil.run.options import Recording, RunOptions
 from hil.scenario import PERIOD_S, TimingLimits
 from hil.signals import Series, signal_of
@@ -195,7 +195,7 @@ def left_run(trace: Trace) -> str:
         return ""
     first = outside[0]
     faults = Fault(int(trace["controller_faults"][first]))
-    why = ", ".join(str(fault.name).lower() for fault in Fault if fault in faults) or "no fault"
+    why = ", ".join(str(fault.name).lower() for fault in faults) or "no fault"
     state_name = State(int(state[first])).name.lower()
     time_s = trace["time_s"][first]
     return (
@@ -206,8 +206,8 @@ def left_run(trace: Trace) -> str:
 def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) -> float:
     """Return the share of bus time that the frames take at `bit_rate`, the bench channel left out."""
     bench = {message.can_id for message in contract.messages if message.bench_channel}
-    frames = recording.traffic.tolist()
-    bits = sum(classic_bits(can_id, dlc, data) for _, can_id, dlc, data in frames if can_id not in bench)
+    carried = recording.traffic[~np.isin(recording.traffic[:, 1], list(bench))]
+    bits = int(traffic_bits(carried).sum())
     return 100.0 * bits / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
 
 

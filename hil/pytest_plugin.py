@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hil.run.rig import Rig
 
 MODES = ("inprocess", "lockstep", "realtime")
-SIDES = {"none": frozenset[str](), "plant": {"plant"}, "controller": {"controller"}}
+STARTS = {"both": ("plant", "controller"), "none": (), "plant": ("plant",), "controller": ("controller",)}
 
 _VIRTUAL = frozenset({"virtual_time", "wire_faults", "power"})
 CAPABILITIES = {  # what a test may need, by interface
@@ -57,7 +57,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--hil-channel", metavar="C", help="its channel; lockstep: for listeners")
     group.addoption(
         "--hil-start",
-        choices=("both", *SIDES),
+        choices=STARTS,
         help="realtime: which side to start here (default none with --hil-interface, else both)",
     )
     group.addoption("--hil-start-timeout", type=float, default=120.0, metavar="S", help="default 120 s")
@@ -200,20 +200,12 @@ def bench(request: pytest.FixtureRequest, bench_at: "Callable[..., Bench]") -> "
 
 def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
     from hil.bus.opening import bus_settings
-    from hil.run.inprocess import InprocessRig
-    from hil.run.lockstep import LockstepRig
-    from hil.run.options import SIDES as BOTH
     from hil.run.options import RigOptions
-    from hil.run.realtime_rig import RealtimeRig
+    from hil.run.rigs import RIGS
 
     interface, channel = config.getoption("hil_interface"), config.getoption("hil_channel")
     bit_rate = config.getoption("hil_bitrate")
     start = config.getoption("hil_start") or ("none" if interface else "both")
-    rigs: dict[str, Callable[[RigOptions], Rig]] = {
-        "inprocess": InprocessRig,
-        "lockstep": LockstepRig,
-        "realtime": RealtimeRig,
-    }
     if interface:
         interface, channel, bit_rate = bus_settings(interface, channel, bit_rate)
     options = RigOptions(
@@ -222,10 +214,10 @@ def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
         interface=interface,
         channel=channel,
         rt_ratio=_ratio(config),
-        started=frozenset(SIDES.get(start, BOTH)),
+        started=frozenset(STARTS[start]),
         start_timeout_s=config.getoption("hil_start_timeout"),
     )
-    return rigs[config.getoption("hil_mode")](options)
+    return RIGS[config.getoption("hil_mode")](options)
 
 
 def _ratio(config: pytest.Config) -> Fraction:

@@ -17,7 +17,7 @@ from dbc.e2e import MAX_COUNTER
 from dbc.node import PERIOD_NS
 from firmware_py.node import EXECUTION_NS
 from hil.bus.wire_core import INTERMISSION_BITS
-from hil.bus.wire_time import classic_bits
+from hil.bus.wire_time import traffic_bits
 from hil.scenario import TimingLimits
 
 RECORDED = "recorded"
@@ -330,8 +330,7 @@ class _Frames:
 
     def duration_ns(self, bit_rate: int) -> np.ndarray:
         """Return each frame's time on the wire from its start to its end, ns."""
-        bits = [classic_bits(*frame) - INTERMISSION_BITS for _, *frame in self._rows.tolist()]
-        return np.array(bits, np.int64) * 1_000_000_000 // bit_rate
+        return (traffic_bits(self._rows) - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
 
     def text(self, index: int) -> str:
         """Return a frame's name, E2E counter and end."""

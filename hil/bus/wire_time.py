@@ -3,6 +3,8 @@
 Lengths run from the start of frame to the end of the three bits of intermission.
 """
 
+from typing import Any
+
 import can
 import numpy as np
 from can.util import dlc2len, len2dlc
@@ -94,6 +96,11 @@ def classic_bits(can_id: int, dlc: int, data: int) -> int:
     stuff_bits += step >> 3
     stuff_bits += STUFFING[(step & 7) << 8 | tail & 0xFF] >> 3
     return header_bits + data_bits + 15 + stuff_bits + UNSTUFFED_BITS
+
+
+def traffic_bits(traffic: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the length of each frame of a log in bits; its rows are time, id, dlc, data."""
+    return np.array([classic_bits(*frame) for _, *frame in traffic.tolist()], np.int64)
 
 
 def fd_bits(message: can.Message) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Self
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from firmware_py.tuning import Tuning
 from hil.bus import link
 from hil.bus.wire import Clock, Port, Wire
 from hil.run.options import INTERRUPTED, Recording, RigOptions, RunOptions, check_bit_rate
-from hil.run.rig import play
+from hil.run.rig import Rig, play
 from hil.supervisor import Supervisor
 from plant_sim.node import Plant
 from plant_sim.parameters import PlantParameters
@@ -32,26 +32,20 @@ def run_inprocess(options: RunOptions) -> Recording:
         return play(rig, options)
 
 
-class InprocessRig:
+class InprocessRig(Rig):
     """All nodes in this process; every session has new ones."""
 
     mode = "inprocess"
     broken = False
 
-    def __init__(self, options: RigOptions) -> None:
-        self.contract = Contract.load(options.dbc)
-        self.bit_rate = options.wire_bit_rate
-        self._options = options
-        self._begin_s = time.perf_counter()
+    def finish(self) -> str:
+        """Have nothing to end."""
+        return ""
 
-    def __enter__(self) -> Self:
-        return self
+    def _open(self, stack: ExitStack) -> None:
+        """Have nothing to start."""
 
-    def __exit__(self, *_: object) -> None:
-        self.finish()
-
-    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "VirtualSession":
-        """Begin a run; see `hil.run.rig.Rig`."""
+    def _begin(self, supervisor: Supervisor, bit_rate: int) -> "VirtualSession":
         plant = Plant(self.contract, PlantParameters())
         firmware = Controller(self.contract, Tuning().calibration().to_bytes())
 
@@ -59,17 +53,13 @@ class InprocessRig:
             return {node.name: node.record.columns_by_name() for node in (plant, firmware)}
 
         return VirtualSession(
-            self._options,
-            make_wire(self.contract, self.bit_rate if bit_rate is None else bit_rate),
-            Supervisor(self.contract, controller, position_m),
+            self.options,
+            make_wire(self.contract, bit_rate),
+            supervisor,
             [plant, firmware],
             records,
-            begin_s=self._begin_s,
+            begin_s=self.begin_s,
         )
-
-    def finish(self) -> str:
-        """Have nothing to end."""
-        return ""
 
 
 class VirtualSession:

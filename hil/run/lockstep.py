@@ -4,11 +4,9 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from typing import Self
 
 import numpy as np
 
-from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from hil.bus.hub import Hub, NodeGoneError
 from hil.bus.opening import BusSettings
@@ -16,7 +14,7 @@ from hil.bus.wire import Wire
 from hil.run.inprocess import Records, VirtualSession, make_wire
 from hil.run.node_processes import NodeProcesses, forget_record, load_record
 from hil.run.options import SIDES, BenchError, InterruptedRunError, Recording, RigOptions, RunOptions
-from hil.run.rig import play
+from hil.run.rig import Rig, play
 from hil.supervisor import Supervisor
 
 AFTERMATH_NS = 100 * PERIOD_NS
@@ -38,7 +36,7 @@ def run_lockstep(options: RunOptions) -> Recording:
         return play(rig, options)
 
 
-class LockstepRig:
+class LockstepRig(Rig):
     """Hub and supervisor here, plant and firmware in processes that answer event by event.
 
     Raises
@@ -50,33 +48,9 @@ class LockstepRig:
     mode = "lockstep"
 
     def __init__(self, options: RigOptions) -> None:
-        self.contract = Contract.load(options.dbc)
-        self.bit_rate = options.wire_bit_rate
+        super().__init__(options)
         self._lost = False
-        self._options = options
-        self._begin_s = time.perf_counter()
-        self._stack = ExitStack()
         self._finished = False
-
-    def __enter__(self) -> Self:
-        options = self._options
-        channel = options.channel or f"run-{os.getpid()}"
-        bit_rate = self.bit_rate
-        with ExitStack() as stack:
-            self.hub = stack.enter_context(
-                Hub(make_wire(self.contract, bit_rate), channel, SIDES, options.answer_timeout_s)
-            )
-            self.processes = stack.enter_context(
-                NodeProcesses(options, BusSettings("hilbus", channel, bit_rate))
-            )
-            self._wait_for_nodes()
-            for pid in self.processes.pids:
-                _set_affinity(pid, _one_core())
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     @property
     def broken(self) -> bool:
@@ -86,19 +60,6 @@ class LockstepRig:
     def give_up(self) -> None:
         """Begin no further session: a process was lost."""
         self._lost = True
-
-    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "LockstepSession":
-        """Begin a run; see `hil.run.rig.Rig`."""
-        wire = make_wire(self.contract, self.bit_rate if bit_rate is None else bit_rate)
-        self.hub.lead_to(wire)
-        for name in SIDES:
-            forget_record(self._options, name)
-            try:
-                self.hub.nodes[name].forget()
-            except NodeGoneError as error:
-                self.give_up()
-                raise BenchError(str(error)) from error
-        return LockstepSession(self, wire, Supervisor(self.contract, controller, position_m), self._begin_s)
 
     def finish(self) -> str:
         """Let the processes write their records and end; return what went wrong with them."""
@@ -113,15 +74,33 @@ class LockstepRig:
             for node in self.hub.nodes.values():
                 with suppress(NodeGoneError):
                     node.save()
-        return {name: load_record(self._options, name) for name in SIDES}
+        return {name: load_record(self.options, name) for name in SIDES}
 
-    @property
-    def options(self) -> RigOptions:
-        """What the rig was asked for."""
-        return self._options
+    def _open(self, stack: ExitStack) -> None:
+        options, bit_rate = self.options, self.bit_rate
+        channel = options.channel or f"run-{os.getpid()}"
+        wire = make_wire(self.contract, bit_rate)
+        self.hub = stack.enter_context(Hub(wire, channel, SIDES, options.answer_timeout_s))
+        bus = BusSettings("hilbus", channel, bit_rate)
+        self.processes = stack.enter_context(NodeProcesses(options, bus))
+        self._wait_for_nodes()
+        for pid in self.processes.pids:
+            _set_affinity(pid, _one_core())
+
+    def _begin(self, supervisor: Supervisor, bit_rate: int) -> "LockstepSession":
+        wire = make_wire(self.contract, bit_rate)
+        self.hub.lead_to(wire)
+        for name in SIDES:
+            forget_record(self.options, name)
+            try:
+                self.hub.nodes[name].forget()
+            except NodeGoneError as error:
+                self.give_up()
+                raise BenchError(str(error)) from error
+        return LockstepSession(self, wire, supervisor, self.begin_s)
 
     def _wait_for_nodes(self) -> None:
-        options = self._options
+        options = self.options
         deadline_s = time.monotonic() + options.start_timeout_s
         while missing := sorted(SIDES - set(self.hub.nodes)):
             self.processes.check()

@@ -9,9 +9,7 @@ from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from statistics import median
 from threading import Thread
-from typing import Self
 
-from dbc.contract import Contract
 from dbc.node import PERIOD_NS
 from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock, Port
@@ -25,10 +23,9 @@ from hil.run.options import (
     InterruptedRunError,
     Recording,
     RigOptions,
-    RunOptions,
 )
 from hil.run.realtime import RealtimeNode
-from hil.run.rig import play
+from hil.run.rig import Rig
 from hil.supervisor import BRING_UP_PERIODS, Supervisor
 
 _POLL_S = 0.05
@@ -44,21 +41,7 @@ _ANSWER_TIMEOUT_S = 10.0
 """How long sides that were heard before may be silent between two sessions, s."""
 
 
-def run_realtime(options: RunOptions) -> Recording:
-    """Play a scenario against the wall clock.
-
-    Raises
-    ------
-    can.CanInitializationError
-        If the bus cannot be opened.
-    BenchError
-        If a side does not come up.
-    """
-    with RealtimeRig(options) as rig:
-        return play(rig, options)
-
-
-class RealtimeRig:
+class RealtimeRig(Rig):
     """Supervisor and log here, plant and firmware in processes of their own, or somebody else's.
 
     Without an interface, a hub of our own serves `hilbus`, whatever python-can's configuration names.
@@ -74,41 +57,13 @@ class RealtimeRig:
     mode = "realtime"
 
     def __init__(self, options: RigOptions) -> None:
-        self.contract = Contract.load(options.dbc)
-        self.options = options
-        self.bit_rate = options.wire_bit_rate
-        self.begin_s = time.perf_counter()
+        super().__init__(options)
         self._session: RealtimeSession | None = None
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            settings = stack.enter_context(_bus_to_use(self.options))
-            self.bus = stack.enter_context(open_bus(*settings))
-            self.listener = Listener(stack.enter_context(open_bus(*settings)))
-            self.processes = stack.enter_context(NodeProcesses(self.options, settings))
-            stack.enter_context(self.listener.listening())
-            self._wait_for_both_sides(self.options.start_timeout_s)
-            stack.callback(self._end_session)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     @property
     def broken(self) -> bool:
         """Whether a process was lost."""
         return self.processes.any_ended or (self._session is not None and self._session.broken)
-
-    def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> "RealtimeSession":
-        """Begin a run; see `hil.run.rig.Rig`."""
-        if bit_rate not in (None, self.bit_rate):
-            raise BenchError(f"this bus runs at {self.bit_rate} bit/s: the test needs virtual time")
-        self._end_session()
-        self._wait_for_both_sides(min(self.options.start_timeout_s, _ANSWER_TIMEOUT_S))
-        self._session = RealtimeSession(self, Supervisor(self.contract, controller, position_m))
-        return self._session
 
     def finish(self) -> str:
         """Let the processes that were started here write their records and end; say what went wrong."""
@@ -143,6 +98,23 @@ class RealtimeRig:
             silent_s = (time.monotonic_ns() - self.listener.newest_ns[can_id]) / 1e9
             if silent_s > longest_s:
                 raise BenchError(f"the {side} has been silent for {silent_s:.1f} s: does it still run?")
+
+    def _open(self, stack: ExitStack) -> None:
+        settings = stack.enter_context(_bus_to_use(self.options))
+        self.bus = stack.enter_context(open_bus(*settings))
+        self.listener = Listener(stack.enter_context(open_bus(*settings)))
+        self.processes = stack.enter_context(NodeProcesses(self.options, settings))
+        stack.enter_context(self.listener.listening())
+        self._wait_for_both_sides(self.options.start_timeout_s)
+        stack.callback(self._end_session)
+
+    def _begin(self, supervisor: Supervisor, bit_rate: int) -> "RealtimeSession":
+        if bit_rate != self.bit_rate:
+            raise BenchError(f"this bus runs at {self.bit_rate} bit/s: the test needs virtual time")
+        self._end_session()
+        self._wait_for_both_sides(min(self.options.start_timeout_s, _ANSWER_TIMEOUT_S))
+        self._session = RealtimeSession(self, supervisor)
+        return self._session
 
     def _end_session(self) -> None:
         if self._session is not None:

@@ -1,12 +1,15 @@
 """What a bench consists of in every mode: a rig that stays, and one session on it after another."""
 
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Protocol, Self
 
 from dbc.contract import Contract
 from hil.bus.wire import Port, Wire
-from hil.run.options import Recording, RunOptions
+from hil.run.options import Recording, RigOptions, RunOptions
 from hil.scenario import PERIOD_S
 from hil.supervisor import BRING_UP_PERIODS, Supervisor
 
@@ -45,8 +48,13 @@ class Session(Protocol):
         """Leave the machine disabled; idempotent."""
 
 
-class Rig(Protocol):
+class Rig(ABC):
     """Bus and nodes; a context manager, at whose end all that it started has ended.
+
+    Parameters
+    ----------
+    options : RigOptions
+        What it is made of.
 
     Attributes
     ----------
@@ -54,22 +62,29 @@ class Rig(Protocol):
         "inprocess", "lockstep" or "realtime".
     contract : Contract
         The DBC.
+    bit_rate : int
+        Bit/s, if a session does not ask for another.
+    begin_s : float
+        `time.perf_counter` when start-up began.
     """
 
     mode: str
-    contract: Contract
 
-    def __enter__(self) -> Self: ...
+    def __init__(self, options: RigOptions) -> None:
+        self.options = options
+        self.contract = Contract.load(options.dbc)
+        self.bit_rate = options.wire_bit_rate
+        self.begin_s = time.perf_counter()
+        self._stack = ExitStack()
 
-    def __exit__(self, *_: object) -> None: ...
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._open(stack)
+            self._stack = stack.pop_all()
+        return self
 
-    @property
-    def bit_rate(self) -> int:
-        """Bit/s."""
-
-    @property
-    def broken(self) -> bool:
-        """Whether a process was lost, so that no further session can begin."""
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
 
     def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> Session:
         """Reset all nodes and begin a run with the machine at rest at `position_m`.
@@ -77,11 +92,26 @@ class Rig(Protocol):
         Raises
         ------
         BenchError
-            If the bus has another bit rate than is asked for.
+            If the bus cannot have that bit rate, or a process was lost.
         """
+        supervisor = Supervisor(self.contract, controller, position_m)
+        return self._begin(supervisor, self.bit_rate if bit_rate is None else bit_rate)
 
+    @property
+    @abstractmethod
+    def broken(self) -> bool:
+        """Whether a process was lost, so that no further session can begin."""
+
+    @abstractmethod
     def finish(self) -> str:
         """End the node processes that were started; return what went wrong with them, or nothing."""
+
+    @abstractmethod
+    def _open(self, stack: ExitStack) -> None:
+        """Start what has to be there for all sessions."""
+
+    @abstractmethod
+    def _begin(self, supervisor: Supervisor, bit_rate: int) -> Session: ...
 
 
 def play(rig: Rig, options: RunOptions) -> Recording:

@@ -9,13 +9,12 @@ import numpy as np
 
 from firmware_py.state_machine import State
 from hil.bench import Bench
-from hil.scenario import load_scenario
+from hil.scenario import PERIOD_S, load_scenario
 from hil.signals import Series
 
 FOLDER = Path(__file__).parent
 TABLE: dict[str, Any] = tomllib.loads((FOLDER / "requirements.toml").read_text(encoding="utf-8"))
 
-PERIOD_S = 1e-3
 MOTOR_RAMP_RPM_S = 4000.0 * 30.0 / np.pi
 MOTOR_LAG_S = 0.040
 """For the motor's first-order lag of 5 ms to fall from 3000 rpm to 1 rpm."""
