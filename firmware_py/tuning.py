@@ -194,3 +194,7 @@ def _feedback(adrc: AdrcTuning) -> dict[int, int]:
         | _gain(k.CAL_FB_A2, adrc.a2n_per_s * acceleration)
         | _gain(k.CAL_FB_Z4, per_b0 * DISTURBANCE_LSB / PERIOD_S**3)
     )
+
+
+TUNINGS = {"paper": Tuning(), "pi_star": Tuning(law=k.LAW_PI, pi=PI_STAR)}
+"""The built-in calibrations by name; each has the law it is named for as its default."""
