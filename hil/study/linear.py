@@ -15,7 +15,9 @@ from scipy.linalg import expm
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import PERIOD_S, AdrcTuning, PiTuning, Tuning
 from plant_sim.derived import linearised, linearised_about, steady_motion
-from plant_sim.parameters import NOMINAL, PlantParameters
+from plant_sim.drive import MAX_DELAY_PERIODS
+from plant_sim.machine import Machine
+from plant_sim.parameters import PlantParameters
 
 FREQUENCIES_RAD_S = np.geomspace(0.1, np.pi / PERIOD_S, 400)
 """Where the sensitivity is looked at, up to Nyquist; each loop's own eigenfrequencies are added."""
@@ -66,38 +68,39 @@ the check valve of the rod side conducting, so that this side's oil is no spring
 """
 
 
-def plant_model(
-    parameters: PlantParameters = NOMINAL,
-    position_m: float = 0.2,
-    delay_periods: int = 1,
-    point: str = "held",
-) -> StateSpace:
-    """Return motor and plant from the speed commanded at t_k (rad/s) to the position at t_k (m).
+def plant_model(machine: Machine, position_m: float, point: str = "held") -> StateSpace:
+    """Return drive, motor and plant, from the speed commanded at t_k (rad/s) to the position at t_k (m).
 
-    The command is held from t_k+delay to t_k+delay+1. States: x, v, p_A, p_B, ω, then the commands on their
-    way, newest first.
+    The command is held from t_k+delay to t_k+delay+1. States: x, v, p_A, p_B, ω, then the last
+    `MAX_DELAY_PERIODS` commands, newest first.
+
+    Parameters
+    ----------
+    machine : Machine
+    position_m : float
+        Rod position, off the stops.
+    point : str
+        One of `OPERATING_POINTS`.
 
     Raises
     ------
     ValueError
-        If the point is none of `OPERATING_POINTS`, the delay below 1 or the position outside the stroke.
+        If there is no such point, or the position is outside the stroke.
     """
     if point not in OPERATING_POINTS:
         raise ValueError(f"point is {point!r}, must be one of {', '.join(OPERATING_POINTS)}")
-    if delay_periods < 1:
-        raise ValueError(f"delay_periods is {delay_periods!r}, must be at least 1")
-    a, b = OPERATING_POINTS[point](parameters, position_m)
-    bandwidth = 1.0 / parameters.motor_time_constant_s
+    a, b = OPERATING_POINTS[point](machine.parameters, position_m)
+    bandwidth = 1.0 / machine.motor_time_constant_s
     continuous = np.zeros((6, 6))  # x, v, p_A, p_B, ω, command
     continuous[:4, :4] = a
     continuous[:4, 4] = b
     continuous[4, 4:] = -bandwidth, bandwidth
-    held = expm(continuous * PERIOD_S)
-    order = 5 + delay_periods
+    sampled = expm(continuous * PERIOD_S)
+    order = 5 + MAX_DELAY_PERIODS
     model = StateSpace(np.zeros((order, order)), np.zeros(order), np.zeros(order), np.zeros(()))
-    model.a[:5, :5] = held[:5, :5]
-    model.a[:5, -1] = held[:5, 5]
-    model.a[6:, 5:-1] = np.eye(delay_periods - 1)
+    model.a[:5, :5] = sampled[:5, :5]
+    model.a[:5, 4 + machine.delay_periods] = sampled[:5, 5]
+    model.a[6:, 5:-1] = np.eye(MAX_DELAY_PERIODS - 1)
     model.b[5] = 1.0
     model.c[0] = 1.0
     return model
@@ -240,8 +243,7 @@ def analyse(
     tuning: Tuning,
     position_m: float,
     *,
-    parameters: PlantParameters = NOMINAL,
-    delay_periods: int = 1,
+    machine: Machine = Machine(),  # noqa: B008 - frozen
     law: int | None = None,
     point: str = "held",
 ) -> LinearLoop:
@@ -252,13 +254,11 @@ def analyse(
     tuning : Tuning
     position_m : float
         Rod position, off the stops.
-    parameters : PlantParameters
-    delay_periods : int
-        Transport delay as in the timing chart, at least 1.
+    machine : Machine
+        Acceleration limit and sensor resolution do not enter.
     law : int, optional
         Control law, instead of the tuning's own.
     point : str
         One of `OPERATING_POINTS`.
     """
-    plant = plant_model(parameters, position_m, delay_periods, point)
-    return linear_loop(plant, controller_model(tuning, position_m, law))
+    return linear_loop(plant_model(machine, position_m, point), controller_model(tuning, position_m, law))
