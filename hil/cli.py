@@ -40,6 +40,8 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
+from hil.study import sweep_command
+from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
 
@@ -49,6 +51,7 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 REFUSALS = (
     BenchError,
+    BoxError,
     CalibrationError,
     can.CanInitializationError,
     ContractError,
@@ -86,13 +89,14 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "run",
         help="play a scenario",
-        usage="hil run SCENARIO [options]",
+        usage="hil run SCENARIO [options]   (name as in `hil list`, or .toml file)",
         epilog=EXIT_CODES,
         formatter_class=_OneLineEach,
     )
     run.set_defaults(command=_run)
-    run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
-    run.add_argument("--controller", choices=CONTROLLERS, help="control law (default: the tuning's own)")
+    run.add_argument("scenario", help=argparse.SUPPRESS)
+    laws = ", ".join(CONTROLLERS)
+    run.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (default: tuning's)")
     add_tuning_arguments(run)
     run.add_argument("--machine", metavar="K=V,...", help="differing machine: mass=1.5,leak=2 ...")
     run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
@@ -113,6 +117,8 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--answer-timeout", type=_seconds, default=10.0, metavar="S", help="for a node to answer"
     )
+
+    sweep_command.add_command(commands)
 
     bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
     bus.set_defaults(command=_bus)
