@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
-from firmware_py.tuning import PI_STAR, PiTuning, Tuning
+from firmware_py.tuning import PI_STAR, CommandFilterTuning, PiTuning, Tuning
 from hil.closed_loop import run_closed_loop
 from hil.study.linear import (
     OPERATING_POINTS,
@@ -33,6 +33,12 @@ TUNINGS = {
     "pi": Tuning(law=k.LAW_PI),
     "pi_star": PI_STAR_TUNING,
     "adrc": Tuning(law=k.LAW_ADRC),
+}
+FILTER = CommandFilterTuning(time_constant_s=3.8e-3, slew_rad_s2=4000.0)
+FILTERED = {
+    "pi_ff": Tuning(law=k.LAW_PI_FF, pi=PI_STAR, command_filter=FILTER),
+    "scheduled": Tuning(law=k.LAW_SCHEDULED, command_filter=FILTER),
+    "scheduled_unfiltered": Tuning(law=k.LAW_SCHEDULED),
 }
 STROKE_OF_THE_DESIGN_M = (3e-4, 0.02, 0.1, 0.2, 0.3, 0.37)
 """The designs' own grid ended at 0.37 m."""
@@ -121,15 +127,13 @@ def test_the_kernel_holds_the_rod_still_where_the_held_loop_is_stable(position_m
     assert analyse(Tuning(), position_m, point="shut").stable
 
 
-@pytest.mark.parametrize("law", TUNINGS)
-def test_the_kernels_small_signal_response_is_the_models(law):
-    tuning = TUNINGS[law]
-    calibration, state, io = (
-        tuning.calibration().array(),
-        np.zeros(k.ST_SIZE, np.int32),
-        np.zeros(6, np.int32),
-    )
-    rest_um, time_s = 200_000, np.arange(400) * 1e-3
+@pytest.mark.parametrize("rest_mm", [20, 200, 390])
+@pytest.mark.parametrize("law", TUNINGS | FILTERED)
+def test_the_kernels_small_signal_response_is_the_models(law, rest_mm):
+    tuning = (TUNINGS | FILTERED)[law]
+    calibration, state = tuning.calibration().array(), np.zeros(k.ST_SIZE, np.int32)
+    io = np.zeros(k.IO_SIZE, np.int32)
+    rest_um, time_s = rest_mm * 1000, np.arange(400) * 1e-3
     swing = np.sin(2 * np.pi * 7.0 * time_s) + 0.5 * np.sin(2 * np.pi * 31.0 * time_s)
     position_um = rest_um + np.rint(20.0 * swing).astype(int)
     io[[k.IO_LAW, k.IO_SETPOINT, k.IO_POSITION]] = tuning.law, rest_um * 10, rest_um
