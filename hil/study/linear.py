@@ -2,8 +2,8 @@
 
 What is outside the feedback (differentiator, setpoint limiter, feed-forward) is left out; so are quantisation
 and the limits of drive, motor and command slew. fal counts with slope 1, its linear zone: beyond it its gain
-falls, so that a verdict holds for small signals only. A loop that is stable here may cycle at large amplitude,
-one that is unstable here may settle on a small cycle.
+falls, so that a verdict holds for small signals only. A loop that is stable here may cycle at a large
+amplitude, one that is unstable here may settle on a small cycle.
 """
 
 import math
