@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -37,6 +38,7 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
+from hil.study import reproduce
 from hil.supervisor import BRING_UP_S
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
@@ -58,6 +60,9 @@ def main(argv: list[str] | None = None) -> int:
     except (BenchError, ScenarioError, ContractError, LinkError, can.CanInitializationError) as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
+    except BrokenProcessPool:
+        print("hil: a worker process was lost (out of memory?): run it again", file=sys.stderr)
+        return EXIT_BROKEN
     return code
 
 
@@ -109,6 +114,8 @@ def _parser() -> argparse.ArgumentParser:
     questions = vcan.add_subparsers(required=True, metavar="QUESTION")
     status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
     status.set_defaults(command=_vcan_status)
+
+    reproduce.add_command(commands)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)

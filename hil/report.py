@@ -4,9 +4,10 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import can
 import numpy as np
@@ -20,8 +21,58 @@ from hil.run.options import BenchError
 BLUE, ORANGE, GREY, RED = "#0b5394", "#d9730d", "#8a8a8a", "#b02a30"
 
 
-class OutputDirectory:
-    """A run's folder: files are made beside it and moved in at the end, so that none is ever half-written.
+class ResultDirectory:
+    """A folder of results: files are made beside it and moved in at the end, so that none is half-written.
+
+    Parameters
+    ----------
+    path : Path
+        The folder; made if it is missing.
+
+    Attributes
+    ----------
+    scratch : Path
+        Where the files are made.
+
+    Raises
+    ------
+    BenchError
+        If the folder cannot be written to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._made = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self.scratch = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=path))
+        except OSError as error:
+            raise BenchError(f"cannot write to {path} ({error.strerror}): choose another --out") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._clean_up()
+
+    def publish(self, made: Sequence[Path], stale: Iterable[Path]) -> list[Path]:
+        """Remove what an earlier run left, move the new files in, and return their paths."""
+        for old in stale:
+            old.unlink(missing_ok=True)
+        for file in made:
+            os.replace(file, self.path / file.name)
+        return [self.path / file.name for file in made]
+
+    def _clean_up(self) -> None:
+        """Remove what is not a result, folders made for nothing included."""
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        with suppress(OSError):  # the first folder that holds something ends it
+            for folder in self._made:
+                folder.rmdir()
+
+
+class OutputDirectory(ResultDirectory):
+    """A run's folder.
 
     Parameters
     ----------
@@ -40,25 +91,13 @@ class OutputDirectory:
         if log_format not in MESSAGE_WRITERS:
             known = ", ".join(sorted(MESSAGE_WRITERS))
             raise BenchError(f"no bus log can be written as {log_format!r}: choose one of {known}")
-        self.path = path
+        super().__init__(path)
         self._log_format = log_format
-        self._made = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self.scratch = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=path))
-        except OSError as error:
-            raise BenchError(f"cannot write to {path} ({error.strerror}): choose another --out") from error
         try:
             write_bus_log(self.scratch / f"probe{log_format}", np.empty((0, 4), np.uint64))
         except (ImportError, NotImplementedError) as error:  # a package that this format needs is missing
             self._clean_up()
             raise BenchError(f"no bus log can be written as {log_format!r}: {error}") from error
-
-    def __enter__(self) -> "OutputDirectory":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._clean_up()
 
     def write(self, result: dict[str, Any], trace: Trace, traffic: np.ndarray) -> list[Path]:
         """Write all files and return their paths."""
@@ -75,21 +114,9 @@ class OutputDirectory:
         if "error_m" in trace and len(trace["time_s"]) > 1:
             made.append(self.scratch / "picture.png")
             draw(made[-1], result, trace)
-        for old in (self.path / name for name in ("result.json", "trace.csv", "picture.png")):
-            old.unlink(missing_ok=True)
-        for old in self.path.glob("bus.*"):
-            if old.suffix in MESSAGE_WRITERS:
-                old.unlink()
-        for file in made:
-            os.replace(file, self.path / file.name)
-        return [self.path / file.name for file in made]
-
-    def _clean_up(self) -> None:
-        """Remove what is not a result, folders made for nothing included."""
-        shutil.rmtree(self.scratch, ignore_errors=True)
-        with suppress(OSError):  # the first folder that holds something ends it
-            for folder in self._made:
-                folder.rmdir()
+        stale = [self.path / name for name in ("result.json", "trace.csv", "picture.png")]
+        stale += [old for old in self.path.glob("bus.*") if old.suffix in MESSAGE_WRITERS]
+        return self.publish(made, stale)
 
 
 def write_bus_log(path: Path, traffic: np.ndarray) -> None:

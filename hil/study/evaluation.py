@@ -1,0 +1,197 @@
+"""The paper's evaluation: who takes part, the runs over the bus, and the tables made of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dbc.contract import Contract
+from firmware_py.tuning import TUNINGS
+from hil.measure import Trace, left_run, result_of, trace_of
+from hil.run.inprocess import run_inprocess
+from hil.run.options import DEFAULT_BIT_RATE, Recording, RunOptions
+from hil.scenario import CONTROLLERS, load_scenario
+from hil.study import paper
+from hil.study.disturbance import observer_error, true_disturbance_m_s3
+
+METRICS = {  # key in result.json and tables.json: what it is, decimals
+    "rms_mm": ("RMS error / mm", 4),
+    "max_mm": ("maximum error / mm", 4),
+    "chatter_rpm_per_period": ("speed chatter / rpm per period", 2),
+}
+_KEPT_COLUMNS = ("time_s", "reference_m", "position_m", "error_m", "load_n")
+OBSERVED, TRUE = "eso_disturbance_m_s3", "true_disturbance_m_s3"
+PAPER_TUNING = "paper"
+_PAPER_LAWS = ("p", "pi", "adrc")
+_LABELS = {
+    "pi_star": "PI*",
+    "pi_ff": "PI+FF",
+    "linear": "linear ADRC",
+    "robust": "robust ADRC",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Contestant:
+    """A controller that takes part: a built-in tuning under one of its laws.
+
+    Attributes
+    ----------
+    label : str
+        Its name in tables and figures.
+    tuning : str
+        Key of `firmware_py.tuning.TUNINGS`.
+    law : str
+        One of `hil.scenario.CONTROLLERS`.
+    """
+
+    label: str
+    tuning: str
+    law: str
+
+    @property
+    def in_paper(self) -> bool:
+        """Whether the paper has figures of it."""
+        return self.tuning == PAPER_TUNING
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One scenario under one contestant.
+
+    Attributes
+    ----------
+    figures : dict
+        A number for each of `METRICS`, and why they are not those of tracking, if so.
+    trace : dict of ndarray
+        What is drawn of it, one row per control period; with the paper's ADRC also the total disturbance that
+        it observed and the true one.
+    """
+
+    figures: dict[str, Any]
+    trace: Trace
+
+
+Runs = Mapping[tuple[str, str], Run]
+"""By scenario and label."""
+
+
+def contestants() -> tuple[Contestant, ...]:
+    """Return the paper's three, then every other built-in tuning under the law that it is named for."""
+    papers = (Contestant(law.upper(), PAPER_TUNING, law) for law in _PAPER_LAWS)
+    others = (
+        Contestant(_LABELS.get(name, name), name, CONTROLLERS[tuning.law - 1])
+        for name, tuning in TUNINGS.items()
+        if name != PAPER_TUNING
+    )
+    return (*papers, *others)
+
+
+def play(task: tuple[str, Contestant]) -> Run:
+    """Play one scenario under one contestant over the bus, all nodes in this process."""
+    name, contestant = task
+    contract = Contract.load()
+    options = RunOptions(load_scenario(name), contestant.law, record_directory=Path())
+    recording = run_inprocess(options)
+    trace = trace_of(recording, contract)
+    result = result_of(recording, trace, contract, options, "inprocess")
+    figures: dict[str, Any] = {metric: result[metric] for metric in METRICS}
+    figures["untrue"] = left_run(trace)
+    kept = {column: trace[column] for column in _KEPT_COLUMNS}
+    if contestant.in_paper and contestant.law == "adrc":
+        kept |= {OBSERVED: trace[OBSERVED], TRUE: _true_disturbance(recording, len(trace["time_s"]))}
+    return Run(figures, kept)
+
+
+def _true_disturbance(recording: Recording, periods: int) -> np.ndarray:
+    assert recording.plant is not None
+    played = recording.plant["time_ns"] >= recording.start_ns
+    record = {name: column[played][:periods] for name, column in recording.plant.items()}
+    return true_disturbance_m_s3(record, TUNINGS[PAPER_TUNING].adrc)
+
+
+def tables_of(runs: Runs, taking_part: Sequence[Contestant], scenarios: Sequence[str]) -> dict[str, Any]:
+    """Return all figures of the evaluation, as written to ``tables.json``."""
+    scenario_tables = {name: _scenario_table(name, runs, taking_part) for name in scenarios}
+    best = [label for table in scenario_tables.values() for row in table["best"].values() for label in row]
+    return {
+        "paper": f"{paper.PUBLISHED}: {paper.TITLE}",
+        "conditions": {"bit_rate": DEFAULT_BIT_RATE, "mode": "inprocess"},
+        "contestants": {
+            one.label: {
+                "tuning": one.tuning,
+                "law": one.law,
+                "in_paper": one.in_paper,
+                "fitted": paper.FITTED_GAINS.get(one.law, "") if one.in_paper else "",
+            }
+            for one in taking_part
+        },
+        "scenarios": scenario_tables,
+        "best_counts": {one.label: best.count(one.label) for one in taking_part},
+        "load_effect_percent": {
+            name: _load_effect(runs, name, loaded)
+            for name, loaded in paper.WITH_LOAD.items()
+            if name in scenarios and loaded in scenarios
+        },
+    }
+
+
+def _scenario_table(name: str, runs: Runs, taking_part: Sequence[Contestant]) -> dict[str, Any]:
+    case, scenario = paper.CASES[name], load_scenario(name)
+    ours = {one.label: _rounded(runs[name, one.label].figures) for one in taking_part}
+    return {
+        "title": case.title,
+        "table": case.table,
+        "figure": case.figure,
+        "fitted": case.fitted,
+        "paper": scenario.paper,
+        "ours": ours,
+        "best": {metric: _best({label: row[metric] for label, row in ours.items()}) for metric in METRICS},
+        "reductions_percent": {
+            metric: {
+                rival: {
+                    "stated": stated,
+                    "from_its_table": _reduction(
+                        scenario.paper["adrc"][metric], scenario.paper[rival][metric]
+                    ),
+                    "ours": _reduction(ours["ADRC"][metric], ours[rival.upper()][metric]),
+                }
+                for rival, stated in rivals.items()
+            }
+            for metric, rivals in case.stated_percent.items()
+        },
+        "disturbance": _disturbance_table(runs[name, "ADRC"].trace),
+    }
+
+
+def _rounded(figures: dict[str, Any]) -> dict[str, Any]:
+    digits = {metric: decimals for metric, (_, decimals) in METRICS.items()}
+    return {key: round(value, digits[key]) if key in digits else value for key, value in figures.items()}
+
+
+def _best(values: dict[str, float]) -> list[str]:
+    """Return who has the smallest value, several if they are equal."""
+    smallest = min(values.values())
+    return [label for label, value in values.items() if value == smallest]
+
+
+def _reduction(adrc: float, rival: float) -> float:
+    return round(100.0 * (1.0 - adrc / rival), 1)
+
+
+def _load_effect(runs: Runs, free: str, loaded: str) -> dict[str, dict[str, float]]:
+    """Return by how many percent the load changes the RMS error, in the paper and here."""
+    papers = {name: load_scenario(name).paper for name in (free, loaded)}
+    effects = {}
+    for law in _PAPER_LAWS:
+        theirs = papers[loaded][law]["rms_mm"] / papers[free][law]["rms_mm"]
+        ours = runs[loaded, law.upper()].figures["rms_mm"] / runs[free, law.upper()].figures["rms_mm"]
+        effects[law] = {"paper": round(100.0 * (theirs - 1.0), 1), "ours": round(100.0 * (ours - 1.0), 1)}
+    return effects
+
+
+def _disturbance_table(trace: Trace) -> dict[str, float]:
+    error = asdict(observer_error(trace[OBSERVED], trace[TRUE]))
+    return {name: round(value, 4 if "relative" in name else 1) for name, value in error.items()}
