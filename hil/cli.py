@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dbc.contract import ContractError
+from firmware_py.calibration import CalibrationError
+from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
@@ -40,10 +43,22 @@ from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
 from hil.study import reproduce
 from hil.supervisor import BRING_UP_S
+from plant_sim.parameters import ParameterError
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
 EXIT_UNUSABLE = 1
 EXIT_INTERRUPTED = 128 + signal.SIGINT
+
+REFUSALS = (
+    BenchError,
+    CalibrationError,
+    can.CanInitializationError,
+    ContractError,
+    LinkError,
+    ParameterError,
+    ScenarioError,
+)
+"""What is wrong at the door: one line, exit code 2."""
 
 EXIT_CODES = """exit codes: 0 played and within the scenario's limits; 1 played, limits missed;
 2 wrong input or no answer; 3 a process was lost; 130 interrupted"""
@@ -57,7 +72,7 @@ def main(argv: list[str] | None = None) -> int:
     except InterruptedRunError as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except (BenchError, ScenarioError, ContractError, LinkError, can.CanInitializationError) as error:
+    except REFUSALS as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
     except BrokenProcessPool:
@@ -82,7 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
     run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
-    run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
+    run.add_argument("--controller", choices=CONTROLLERS, help="control law (default: the tuning's own)")
+    add_tuning_arguments(run)
+    run.add_argument("--machine", metavar="K=V,...", help="differing machine: mass=1.5,leak=2 ...")
     run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
@@ -138,6 +155,8 @@ def _seconds(text: str) -> float:
 
 def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
+    if arguments.machine is not None:
+        scenario = replace(scenario, machine=scenario.machine.with_text(arguments.machine))
     if arguments.bitrate is not None:
         check_bit_rate(arguments.bitrate)
     bus = arguments.interface, arguments.channel, arguments.bitrate
@@ -153,7 +172,8 @@ def _run(arguments: argparse.Namespace) -> int:
         with _progress(console, scenario.name, scenario.duration_s + BRING_UP_S) as progress:
             options = RunOptions(
                 scenario=scenario,
-                controller=arguments.controller,
+                controller=arguments.controller or "",
+                tuning=tuning_of(arguments),
                 record_directory=folder.scratch,
                 bit_rate=bit_rate,
                 dbc=arguments.dbc,

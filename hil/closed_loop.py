@@ -29,10 +29,10 @@ from plant_sim.parameters import PlantParameters
 from plant_sim.period import PERIOD_S, SUBSTEPS
 from plant_sim.sensors import quantised_um
 
-RUNNING_BEFORE_START = {1: 57, 2: 57, 3: 57}
-"""Periods that the controller has been in Run when a scenario starts, by delay of the drive.
+RUNNING_BEFORE_START_PERIODS = 58
+"""How long the controller has been in Run when a scenario starts, on a bus at 1 Mbit/s.
 
-They follow from the bring-up on the bus: tests/hil/test_closed_loop_and_bus.py compares.
+It follows from the supervisor's bring-up: tests/hil/test_scenarios.py compares.
 """
 
 
@@ -233,7 +233,7 @@ def play_closed_loop(
         parameters=parameters,
         position_lsb_um=machine.position_lsb_um,
         delay_periods=machine.delay_periods,
-        hold_periods=RUNNING_BEFORE_START[machine.delay_periods],
+        hold_periods=RUNNING_BEFORE_START_PERIODS,
         initial_m=min(max(setpoint[0] * SETPOINT_LSB_M, 0.0), parameters.stroke_m),
     )
     return replace(run, reference_m=reference_m)

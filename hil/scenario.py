@@ -19,6 +19,11 @@ PERIOD_S = PERIOD_NS * 1e-9
 MAX_LOAD_N = 1e6
 
 
+def controller_of(law: int) -> str:
+    """Return the name of a control law by its number on the bus."""
+    return CONTROLLERS[law - 1]
+
+
 class ScenarioError(ValueError):
     """A scenario does not exist or does not make sense; the message says what to do."""
 
