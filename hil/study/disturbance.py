@@ -1,7 +1,7 @@
 """The total disturbance that an observer should see, from the plant's own equations."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,8 +75,8 @@ def true_disturbance_m_s3(
         "motor_speed_rad_s",
         "load_n",
     )
-    rows = zip(*(record[name].tolist() for name in columns), strict=True)
-    acceleration, jerk = np.array([_acceleration_and_jerk(*row, p) for row in rows]).T
+    rows = np.column_stack([record[name] for name in columns]).tolist()
+    acceleration, jerk = np.array([_acceleration_and_jerk(row, p) for row in rows]).T
     nominal = adrc.a1n_per_s2 * record["velocity_m_s"] + adrc.a2n_per_s * acceleration
     return jerk - nominal - adrc.b0_m_s2_per_rad * record["speed_command_rad_s"]
 
@@ -98,9 +98,8 @@ def observer_error(observed_m_s3: np.ndarray, true_m_s3: np.ndarray) -> Observer
     )
 
 
-def _acceleration_and_jerk(  # one argument for each state
-    x: float, v: float, p_a: float, p_b: float, line: float, speed: float, load: float, p: np.ndarray
-) -> tuple[float, float]:
+def _acceleration_and_jerk(row: Sequence[float], p: np.ndarray) -> tuple[float, float]:
+    x, v, p_a, p_b, line, speed, load = row
     volume_a, volume_b = chamber_volumes(x, p)
     flow_a, loss_a, flow_b, loss_b = pump_flows(speed, p)
     offset_a, slope_a, _, _ = chamber_inflow(p_a, flow_a, loss_a, line, p)

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from dbc.contract import Contract
+from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.tuning import TUNINGS
 from hil.measure import Trace, left_run, result_of, trace_of
 from hil.run.inprocess import run_inprocess
 from hil.run.options import DEFAULT_BIT_RATE, Recording, RunOptions
-from hil.scenario import CONTROLLERS, load_scenario
+from hil.scenario import controller_of, load_scenario
 from hil.study import paper
 from hil.study.disturbance import observer_error, true_disturbance_m_s3
 
@@ -82,7 +83,7 @@ def contestants() -> tuple[Contestant, ...]:
     """Return the paper's three, then every other built-in tuning under the law that it is named for."""
     papers = (Contestant(law.upper(), PAPER_TUNING, law) for law in _PAPER_LAWS)
     others = (
-        Contestant(_LABELS.get(name, name), name, CONTROLLERS[tuning.law - 1])
+        Contestant(_LABELS.get(name, name), name, controller_of(tuning.law))
         for name, tuning in TUNINGS.items()
         if name != PAPER_TUNING
     )
@@ -93,7 +94,12 @@ def play(task: tuple[str, Contestant]) -> Run:
     """Play one scenario under one contestant over the bus, all nodes in this process."""
     name, contestant = task
     contract = Contract.load()
-    options = RunOptions(load_scenario(name), contestant.law, record_directory=Path())
+    options = RunOptions(
+        scenario=load_scenario(name),
+        controller=contestant.law,
+        tuning=chosen_tuning(contestant.tuning),
+        record_directory=Path(),
+    )
     recording = run_inprocess(options)
     trace = trace_of(recording, contract)
     result = result_of(recording, trace, contract, options, "inprocess")

@@ -31,7 +31,7 @@ _PANEL_IN = 1.7
 
 Draw = Callable[[Figure], None]
 
-_SETTINGS = {
+_SETTINGS: dict[Any, Any] = {
     "svg.hashsalt": "hil",
     "svg.fonttype": "none",
     "font.size": 9.0,
