@@ -91,13 +91,14 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "run",
         help="play a scenario",
-        usage="hil run SCENARIO [options]",
+        usage="hil run SCENARIO [options]   (name as in `hil list`, or .toml file)",
         epilog=EXIT_CODES,
         formatter_class=_OneLineEach,
     )
     run.set_defaults(command=_run)
-    run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
-    run.add_argument("--controller", choices=CONTROLLERS, help="control law (default: the tuning's own)")
+    run.add_argument("scenario", help=argparse.SUPPRESS)
+    laws = ", ".join(CONTROLLERS)
+    run.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (default: tuning's)")
     add_tuning_arguments(run)
     run.add_argument("--machine", metavar="K=V,...", help="differing machine: mass=1.5,leak=2 ...")
     run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")

@@ -20,6 +20,7 @@ from firmware_py.kernel.layout import (
 )
 from hil.references import SETPOINT_LSB_M, setpoint_counts
 from hil.scenario import Scenario
+from hil.supervisor import BRING_UP_PERIODS
 from plant_sim.drive import COUNTS_PER_RPM, RAD_S_PER_COUNT
 from plant_sim.equilibrium import initial_state
 from plant_sim.integrator import advance
@@ -32,7 +33,7 @@ from plant_sim.sensors import quantised_um
 RUNNING_BEFORE_START_PERIODS = 58
 """How long the controller has been in Run when a scenario starts, on a bus at 1 Mbit/s.
 
-It follows from the supervisor's bring-up: tests/hil/test_scenarios.py compares.
+It follows from the supervisor's bring-up: tests/hil/study/test_loop_and_bus.py compares.
 """
 
 
@@ -136,7 +137,7 @@ def run_closed_loop(
     position_lsb_um: int = 1,
     delay_periods: int = 1,
     hold_periods: int = 0,
-    initial_m: float = 0.0,
+    plant: np.ndarray | None = None,
 ) -> ClosedLoopRun:
     """Run kernel and plant over a whole reference.
 
@@ -160,8 +161,9 @@ def run_closed_loop(
         Transport delay, at least 1.
     hold_periods : int
         Periods at the first setpoint, without load, before k = 0.
-    initial_m : float
-        Where the machine rests at the beginning.
+    plant : ndarray, optional
+        State of the plant at the beginning, see `plant_sim.layout`; at rest, retracted, if not given. It is
+        advanced in place.
     """
     if setpoint.shape != load_n.shape or delay_periods < 1 or position_lsb_um < 1 or hold_periods < 0:
         raise ValueError("closed loop: setpoint and load differ in length, or an option is out of range")
@@ -176,7 +178,7 @@ def run_closed_loop(
         calibration.array(),
         np.zeros(ST_SIZE, np.int32),
         io,
-        initial_state(parameters, initial_m),
+        initial_state(parameters) if plant is None else plant,
         parameters.vector(),
         np.ascontiguousarray(setpoint, np.int32),
         np.ascontiguousarray(load_n, np.float64),
@@ -225,6 +227,9 @@ def play_closed_loop(
     machine = machine or scenario.machine
     parameters, reference_m = machine.parameters, scenario.reference_m()
     setpoint = setpoint_counts(reference_m)
+    plant = initial_state(parameters, min(max(setpoint[0] * SETPOINT_LSB_M, 0.0), parameters.stroke_m))
+    for _ in range(BRING_UP_PERIODS - RUNNING_BEFORE_START_PERIODS):
+        advance(plant, parameters.vector(), 0.0, 0.0, PERIOD_S, SUBSTEPS)
     run = run_closed_loop(
         calibration,
         setpoint,
@@ -234,6 +239,6 @@ def play_closed_loop(
         position_lsb_um=machine.position_lsb_um,
         delay_periods=machine.delay_periods,
         hold_periods=RUNNING_BEFORE_START_PERIODS,
-        initial_m=min(max(setpoint[0] * SETPOINT_LSB_M, 0.0), parameters.stroke_m),
+        plant=plant,
     )
     return replace(run, reference_m=reference_m)
