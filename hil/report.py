@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
@@ -21,8 +20,8 @@ from hil.run.options import BenchError
 BLUE, ORANGE, GREY, RED = "#0b5394", "#d9730d", "#8a8a8a", "#b02a30"
 
 
-class ResultDirectory:
-    """A folder of results: files are made beside it and moved in at the end, so that none is half-written.
+class ResultFolder:
+    """A folder whose files are made beside it and moved in at the end, so that none is ever half-written.
 
     Parameters
     ----------
@@ -31,6 +30,8 @@ class ResultDirectory:
 
     Attributes
     ----------
+    path : Path
+        The folder.
     scratch : Path
         Where the files are made.
 
@@ -55,13 +56,9 @@ class ResultDirectory:
     def __exit__(self, *_: object) -> None:
         self._clean_up()
 
-    def publish(self, made: Sequence[Path], stale: Iterable[Path]) -> list[Path]:
-        """Remove what an earlier run left, move the new files in, and return their paths."""
-        for old in stale:
-            old.unlink(missing_ok=True)
-        for file in made:
-            os.replace(file, self.path / file.name)
-        return [self.path / file.name for file in made]
+    def move_in(self, made: list[Path]) -> list[Path]:
+        """Move files from the scratch folder in and return their paths."""
+        return [file.replace(self.path / file.name) for file in made]
 
     def _clean_up(self) -> None:
         """Remove what is not a result, folders made for nothing included."""
@@ -71,7 +68,7 @@ class ResultDirectory:
                 folder.rmdir()
 
 
-class OutputDirectory(ResultDirectory):
+class OutputDirectory(ResultFolder):
     """A run's folder.
 
     Parameters
@@ -114,9 +111,12 @@ class OutputDirectory(ResultDirectory):
         if "error_m" in trace and len(trace["time_s"]) > 1:
             made.append(self.scratch / "picture.png")
             draw(made[-1], result, trace)
-        stale = [self.path / name for name in ("result.json", "trace.csv", "picture.png")]
-        stale += [old for old in self.path.glob("bus.*") if old.suffix in MESSAGE_WRITERS]
-        return self.publish(made, stale)
+        for old in (self.path / name for name in ("result.json", "trace.csv", "picture.png")):
+            old.unlink(missing_ok=True)
+        for old in self.path.glob("bus.*"):
+            if old.suffix in MESSAGE_WRITERS:
+                old.unlink()
+        return self.move_in(made)
 
 
 def write_bus_log(path: Path, traffic: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from hil.report import ResultDirectory
+from hil.report import ResultFolder
 from hil.run.options import INTERRUPTED, InterruptedRunError
 from hil.run.stopping import StopFlag
 from hil.study import paper
@@ -143,16 +143,18 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with (
-        ResultDirectory(arguments.out) as folder,
+        ResultFolder(arguments.out) as folder,
         all_cores() as cores,
         Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
     ):
         tables, made = evaluate(folder.scratch, list(paper.CASES), contestants(), cores, stopped, progress)
-        folder.publish(made, _of_an_earlier_run(arguments.out))
+        for old in _of_an_earlier_run(arguments.out):
+            old.unlink()
+        folder.move_in(made)
     if arguments.json:
         print(_json(tables), end="")
     else:
-        Console().print(_summary(tables))
+        Console().print(summary(tables))
         print(f"report.html, tables.json and {len(made) - 2} pictures in {arguments.out}")
     return 0
 
@@ -166,7 +168,8 @@ def _json(tables: dict[str, Any]) -> str:
     return json.dumps(tables, indent=1, ensure_ascii=False) + "\n"
 
 
-def _summary(tables: dict[str, Any]) -> Table:
+def summary(tables: dict[str, Any]) -> Table:
+    """Return the errors as a table for the screen."""
     table = Table(title="RMS / maximum error, mm", box=None)
     table.add_column("")
     for name in tables["scenarios"]:

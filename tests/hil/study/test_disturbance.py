@@ -1,4 +1,4 @@
-"""The true total disturbance against a finely stepped plant, and the observer against what theory says of it."""
+"""The true total disturbance against a finely stepped plant; the observer's lag against theory."""
 
 from pathlib import Path
 
