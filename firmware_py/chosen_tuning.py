@@ -20,10 +20,13 @@ class ChosenTuning:
         Of the tuning, or of the file.
     calibration : Calibration
         The block.
+    is_file : bool
+        Whether `name` is a file's.
     """
 
     name: str
     calibration: Calibration
+    is_file: bool = False
 
 
 def chosen_tuning(name: str | None = None, file: Path | None = None) -> ChosenTuning:
@@ -42,7 +45,7 @@ def chosen_tuning(name: str | None = None, file: Path | None = None) -> ChosenTu
     if name is not None:
         raise CalibrationError("a tuning and a calibration file exclude each other: give one")
     try:
-        return ChosenTuning(str(file), Calibration.from_bytes(file.read_bytes()))
+        return ChosenTuning(str(file), Calibration.from_bytes(file.read_bytes()), is_file=True)
     except OSError as error:
         raise CalibrationError(f"cannot read calibration file {file} ({error.strerror})") from error
     except CalibrationError as error:

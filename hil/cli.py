@@ -41,7 +41,8 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
-from hil.study import reproduce
+from hil.study import reproduce, sweep_command
+from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
 
@@ -51,6 +52,7 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 
 REFUSALS = (
     BenchError,
+    BoxError,
     CalibrationError,
     can.CanInitializationError,
     ContractError,
@@ -119,6 +121,8 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--answer-timeout", type=_seconds, default=10.0, metavar="S", help="for a node to answer"
     )
+
+    sweep_command.add_command(commands)
 
     bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
     bus.set_defaults(command=_bus)

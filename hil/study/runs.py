@@ -5,14 +5,17 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from dbc.jit import source_digest
 from firmware_py.calibration import Calibration
 from hil.closed_loop import play_closed_loop
+from hil.run.options import BenchError
 from hil.scenario import Scenario, load_scenario
 from plant_sim.machine import Machine
 
@@ -26,6 +29,7 @@ FAILED_RMS_MM = 2.0
 
 _RUNS_PER_TASK = 16
 _PR_SET_PDEATHSIG = 1
+_CLUSTER_TIMEOUT_S = 10
 
 
 def failed(rms_mm: np.ndarray) -> np.ndarray:
@@ -136,6 +140,57 @@ def all_cores(workers: int | None = None) -> Iterator[Executor]:
         yield executor
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def dask_cluster(address: str) -> Iterator[Executor]:
+    """Use the workers of a Dask cluster, which need this version of the project installed.
+
+    Parameters
+    ----------
+    address : str
+        Of its scheduler, e.g. "tcp://127.0.0.1:8786".
+
+    Raises
+    ------
+    BenchError
+        If the package is missing, no scheduler answers there, it has no workers, or they have other sources.
+    BrokenExecutor
+        From the context, if workers are lost for good.
+    """
+    try:
+        from distributed import CancelledError, Client, KilledWorker
+    except ImportError:
+        raise BenchError("--cluster needs Dask: pip install 'ddh-hil[cluster]'") from None
+    try:
+        client = Client(address, timeout=_CLUSTER_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        raise BenchError(f"no Dask scheduler answers at {address}: {error}") from error
+    with client:
+        _check_workers(client, address)
+        executor = client.get_executor(pure=False)
+        try:
+            yield executor
+        except (CancelledError, KilledWorker) as error:
+            raise BrokenExecutor(f"the cluster lost the runs: {error}") from error
+        finally:
+            executor.shutdown(wait=False)
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Make sure that there are workers, and that they compute what this process would."""
+    try:
+        sources = client.run(_source)
+    except Exception as error:  # whatever an import there raises
+        raise BenchError(f"a worker of {address} cannot load ddh-hil ({error}): install it there") from error
+    if not sources:
+        raise BenchError(f"the Dask scheduler at {address} has no workers: start some with `dask worker`")
+    if others := [worker for worker, source in sources.items() if source != _source()]:
+        raise BenchError(f"worker {others[0]} has other sources of ddh-hil: install the same there")
+
+
+def _source() -> str:
+    return source_digest("dbc", "firmware_py", "plant_sim", "hil")
 
 
 def _cores() -> int:
