@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy import signal
+from scipy.linalg import expm
 
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
@@ -44,6 +45,21 @@ def largest_ms(tuning, point="shut"):
 def test_ms_of_the_designs_is_that_of_the_papers_model_with_both_chambers_shut():
     assert largest_ms(TUNINGS["adrc"]) == pytest.approx(1.82, abs=0.01)
     assert largest_ms(TUNINGS["pi_star"]) == pytest.approx(2.00, abs=0.01)
+
+
+@pytest.mark.parametrize("point", OPERATING_POINTS)
+@pytest.mark.parametrize("position_m", [3e-4, 0.2, 0.395])
+def test_the_plant_is_sampled_as_the_matrix_exponential_says(position_m, point):
+    a, b = OPERATING_POINTS[point](P, position_m)
+    rate = 1.0 / P.motor_time_constant_s
+    continuous = np.zeros((6, 6))  # x, v, p_A, p_B, ω, command
+    continuous[:4, :5] = np.column_stack([a, b])
+    continuous[4, 4:] = -rate, rate
+    expected = expm(continuous * 1e-3)[:5]
+    model = plant_model(Machine(), position_m, point)
+    row_scale = np.abs(expected).max(axis=1, keepdims=True)
+    sampled = np.column_stack([model.a[:5, :5], model.a[:5, 5]])
+    assert sampled / row_scale == pytest.approx(expected / row_scale, abs=1e-6)
 
 
 def held_run(controller, position_m, periods, delay_periods=1):
