@@ -13,18 +13,26 @@ from firmware_py.tuning import TUNINGS
 from hil.measure import Trace, left_run, result_of, trace_of
 from hil.run.inprocess import run_inprocess
 from hil.run.options import DEFAULT_BIT_RATE, Recording, RunOptions
-from hil.scenario import controller_of, load_scenario
+from hil.scenario import CONTROLLERS, controller_of, load_scenario
 from hil.study import paper
+from hil.study.box import load_box
 from hil.study.disturbance import observer_error, true_disturbance_m_s3
+from hil.study.runs import FAILED_RMS_MM
+from hil.study.stability import StabilityMap, map_machines, stability_maps
+from hil.study.sweep import Sweep
 
 METRICS = {  # key in result.json and tables.json: what it is, decimals
-    "rms_mm": ("RMS error / mm", 4),
-    "max_mm": ("maximum error / mm", 4),
+    "rms_mm": ("RMS error / mm", 3),
+    "max_mm": ("maximum error / mm", 3),
     "chatter_rpm_per_period": ("speed chatter / rpm per period", 2),
 }
 _KEPT_COLUMNS = ("time_s", "reference_m", "position_m", "error_m", "load_n")
 OBSERVED, TRUE = "eso_disturbance_m_s3", "true_disturbance_m_s3"
 PAPER_TUNING = "paper"
+SWEPT = "sine"
+SAMPLES = 64
+DIGITS = 5
+"""Significant ones in ``tables.json``."""
 _PAPER_LAWS = ("p", "pi", "adrc")
 _LABELS = {
     "pi_star": "PI*",
@@ -51,6 +59,11 @@ class Contestant:
     label: str
     tuning: str
     law: str
+
+    @property
+    def law_number(self) -> int:
+        """Number of the law on the bus."""
+        return 1 + CONTROLLERS.index(self.law)
 
     @property
     def in_paper(self) -> bool:
@@ -118,11 +131,51 @@ def _true_disturbance(recording: Recording, periods: int) -> np.ndarray:
     return true_disturbance_m_s3(record, TUNINGS[PAPER_TUNING].adrc)
 
 
-def tables_of(runs: Runs, taking_part: Sequence[Contestant], scenarios: Sequence[str]) -> dict[str, Any]:
-    """Return all figures of the evaluation, as written to ``tables.json``."""
+def sweep_of(contestant: Contestant) -> Sweep:
+    """Return the small sweep that a contestant is put through."""
+    box = load_box()
+    return Sweep(
+        names=(SWEPT,),
+        scenarios=(load_scenario(SWEPT),),
+        duration_s=None,
+        tuning=chosen_tuning(contestant.tuning),
+        controller=contestant.law,
+        box=box,
+        design="latin hypercube",
+        seed=0,
+        machines=tuple(box.samples(SAMPLES)),
+    )
+
+
+def stability_of(taking_part: Sequence[Contestant]) -> dict[str, StabilityMap]:
+    """Return the linear loops of all contestants over stroke and machines."""
+    tunings = {one.label: (TUNINGS[one.tuning], one.law_number) for one in taking_part}
+    return stability_maps(tunings, map_machines())
+
+
+def tables_of(
+    taking_part: Sequence[Contestant],
+    scenarios: Sequence[str],
+    runs: Runs,
+    swept: Mapping[str, Mapping[str, Any]],
+    maps: Mapping[str, StabilityMap],
+) -> dict[str, Any]:
+    """Return all figures of the evaluation, as written to ``tables.json``, with `DIGITS` digits.
+
+    Parameters
+    ----------
+    taking_part : sequence of Contestant
+    scenarios : sequence of str
+        Some of `hil.study.paper.CASES`.
+    runs : mapping of Run
+    swept : mapping of mapping
+        By label, from `hil.study.sweep.Sweep.summary`.
+    maps : mapping of StabilityMap
+        By label.
+    """
     scenario_tables = {name: _scenario_table(name, runs, taking_part) for name in scenarios}
     best = [label for table in scenario_tables.values() for row in table["best"].values() for label in row]
-    return {
+    tables = {
         "paper": f"{paper.PUBLISHED}: {paper.TITLE}",
         "conditions": {"bit_rate": DEFAULT_BIT_RATE, "mode": "inprocess"},
         "contestants": {
@@ -141,12 +194,31 @@ def tables_of(runs: Runs, taking_part: Sequence[Contestant], scenarios: Sequence
             for name, loaded in paper.WITH_LOAD.items()
             if name in scenarios and loaded in scenarios
         },
+        "robustness": {
+            "scenario": SWEPT,
+            "samples": SAMPLES,
+            "failed_above_mm": FAILED_RMS_MM,
+            "contestants": {
+                label: {key: summary[key] for key in ("failures", "rms_mm", "chatter_rpm")}
+                for label, summary in swept.items()
+            },
+        },
+        "stability": {label: one.summary() for label, one in maps.items()},
     }
+    return dict(_shortened(tables))
+
+
+def _shortened(value: Any) -> Any:
+    """Return nested figures with `DIGITS` significant digits."""
+    if isinstance(value, Mapping):
+        return {key: _shortened(inner) for key, inner in value.items()}
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
 def _scenario_table(name: str, runs: Runs, taking_part: Sequence[Contestant]) -> dict[str, Any]:
     case, scenario = paper.CASES[name], load_scenario(name)
-    ours = {one.label: _rounded(runs[name, one.label].figures) for one in taking_part}
+    adrc = runs[name, "ADRC"].trace
+    ours = {one.label: runs[name, one.label].figures for one in taking_part}
     return {
         "title": case.title,
         "table": case.table,
@@ -168,13 +240,8 @@ def _scenario_table(name: str, runs: Runs, taking_part: Sequence[Contestant]) ->
             }
             for metric, rivals in case.stated_percent.items()
         },
-        "disturbance": _disturbance_table(runs[name, "ADRC"].trace),
+        "disturbance": asdict(observer_error(adrc[OBSERVED], adrc[TRUE])),
     }
-
-
-def _rounded(figures: dict[str, Any]) -> dict[str, Any]:
-    digits = {metric: decimals for metric, (_, decimals) in METRICS.items()}
-    return {key: round(value, digits[key]) if key in digits else value for key, value in figures.items()}
 
 
 def _best(values: dict[str, float]) -> list[str]:
@@ -184,7 +251,7 @@ def _best(values: dict[str, float]) -> list[str]:
 
 
 def _reduction(adrc: float, rival: float) -> float:
-    return round(100.0 * (1.0 - adrc / rival), 1)
+    return 100.0 * (1.0 - adrc / rival)
 
 
 def _load_effect(runs: Runs, free: str, loaded: str) -> dict[str, dict[str, float]]:
@@ -194,10 +261,5 @@ def _load_effect(runs: Runs, free: str, loaded: str) -> dict[str, dict[str, floa
     for law in _PAPER_LAWS:
         theirs = papers[loaded][law]["rms_mm"] / papers[free][law]["rms_mm"]
         ours = runs[loaded, law.upper()].figures["rms_mm"] / runs[free, law.upper()].figures["rms_mm"]
-        effects[law] = {"paper": round(100.0 * (theirs - 1.0), 1), "ours": round(100.0 * (ours - 1.0), 1)}
+        effects[law] = {"paper": 100.0 * (theirs - 1.0), "ours": 100.0 * (ours - 1.0)}
     return effects
-
-
-def _disturbance_table(trace: Trace) -> dict[str, float]:
-    error = asdict(observer_error(trace[OBSERVED], trace[TRUE]))
-    return {name: round(value, 4 if "relative" in name else 1) for name, value in error.items()}

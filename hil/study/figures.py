@@ -41,6 +41,7 @@ _SETTINGS: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.xmargin": 0.01,
     "lines.linewidth": 1.1,
+    "figure.constrained_layout.w_pad": 0.1,
     "legend.frameon": False,
     "legend.fontsize": 8.0,
 }

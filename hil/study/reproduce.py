@@ -2,11 +2,11 @@
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -16,13 +16,13 @@ from hil.report import ResultFolder
 from hil.run.options import INTERRUPTED, InterruptedRunError
 from hil.run.stopping import StopFlag
 from hil.study import paper
-from hil.study.evaluation import Contestant, Runs, contestants, play, tables_of
-from hil.study.runs import all_cores
+
+if TYPE_CHECKING:
+    from hil.study.evaluation import Contestant, Runs
+    from hil.study.stability import StabilityMap
 
 DEFAULT_OUT = Path("out/reproduce")
 _POLL_S = 0.1
-
-Done = Callable[[], None]
 
 
 def add_command(commands: Any) -> None:
@@ -42,12 +42,12 @@ def add_command(commands: Any) -> None:
 def evaluate(
     folder: Path,
     scenarios: Sequence[str],
-    taking_part: Sequence[Contestant],
+    taking_part: Sequence["Contestant"],
     cores: Executor,
     stopped: StopFlag,
     progress: Progress,
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Play and draw everything.
+    """Play, sweep, analyse and draw everything.
 
     Parameters
     ----------
@@ -71,16 +71,17 @@ def evaluate(
     made : list of Path
         The files.
     """
+    from hil.study.evaluation import play, stability_of, tables_of
+    from hil.study.report_page import page
+
     pairs = [(name, one) for name in scenarios for one in taking_part]
     played = _all(cores, [partial(play, pair) for pair in pairs], stopped, progress, "playing")
     runs = {(name, one.label): run for (name, one), run in zip(pairs, played, strict=True)}
-    tables = tables_of(runs, taking_part, scenarios)
-    drawings = _drawings(folder, scenarios, taking_part, runs, tables)
-    drawn = _all(cores, drawings, stopped, progress, "drawing")
-    pictures = [path for paths in drawn for path in paths]
-
-    from hil.study.report_page import page
-
+    swept = _swept(taking_part, cores, stopped, progress)
+    maps = stability_of(taking_part)
+    tables = tables_of(taking_part, scenarios, runs, swept, maps)
+    drawings = _drawings(folder, taking_part, scenarios, runs, maps, tables)
+    pictures = [path for paths in _all(cores, drawings, stopped, progress, "drawing") for path in paths]
     made = [folder / "tables.json", folder / "report.html"]
     made[0].write_text(_json(tables), encoding="utf-8")
     svg = {path.stem: path for path in pictures if path.suffix == ".svg"}
@@ -88,28 +89,56 @@ def evaluate(
     return tables, made + pictures
 
 
+def _swept(
+    taking_part: Sequence["Contestant"], cores: Executor, stopped: StopFlag, progress: Progress
+) -> dict[str, dict[str, Any]]:
+    """Return what comes of each contestant's sweep, by label."""
+    from hil.study.evaluation import sweep_of
+    from hil.study.runs import figures_of
+
+    sweeps = {one.label: sweep_of(one) for one in taking_part}
+    bar = progress.add_task("sweeping", total=sum(len(sweep.machines) for sweep in sweeps.values()))
+    swept, done = {}, 0
+
+    def advance(machines: int) -> None:
+        progress.update(bar, completed=done + machines)
+        if stopped.is_set():
+            raise InterruptedRunError(INTERRUPTED)
+
+    for label, sweep in sweeps.items():
+        figures = figures_of(
+            sweep.tuning.calibration, sweep.scenarios, sweep.machines, cores, law=sweep.law, progress=advance
+        )
+        swept[label] = sweep.summary(figures)
+        done += len(sweep.machines)
+    return swept
+
+
 def _drawings(
     folder: Path,
+    taking_part: Sequence["Contestant"],
     scenarios: Sequence[str],
-    taking_part: Sequence[Contestant],
-    runs: Runs,
+    runs: "Runs",
+    maps: Mapping[str, "StabilityMap"],
     tables: dict[str, Any],
 ) -> list[Callable[[], list[Path]]]:
-    from hil.study import figures  # matplotlib takes a third of a second, which only drawing should cost
+    from hil.study import figures
+    from hil.study.stability import heat_map
 
     def drawing(name: str, drawer: Callable[..., figures.Draw], *content: Any) -> Callable[[], list[Path]]:
         return partial(_draw, folder, name, drawer, content)
 
-    tracking = ("P", "PI", "ADRC")
+    trackings = [
+        drawing(
+            f"figure_{paper.CASES[name].figure}",
+            figures.tracking,
+            {label: runs[name, label].trace for label in ("P", "PI", "ADRC")},
+        )
+        for name in scenarios
+    ]
     return [
-        *(
-            drawing(
-                f"figure_{paper.CASES[name].figure}",
-                figures.tracking,
-                {label: runs[name, label].trace for label in tracking},
-            )
-            for name in scenarios
-        ),
+        drawing("stability", heat_map, maps),
+        *trackings,
         drawing("rivals", figures.rivals, scenarios, runs, taking_part),
         drawing("comparison", figures.comparison, tables, taking_part),
     ]
@@ -139,6 +168,9 @@ def _all(
 
 
 def _reproduce(arguments: argparse.Namespace) -> int:
+    from hil.study.evaluation import contestants  # compiles what has changed
+    from hil.study.runs import all_cores
+
     stopped = StopFlag.on_signals()
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -160,7 +192,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 
 
 def _of_an_earlier_run(out: Path) -> Iterable[Path]:
-    names = "figure_*", "rivals", "comparison"
+    names = "figure_*", "rivals", "comparison", "stability"
     return [path for name in names for suffix in (".svg", ".png") for path in out.glob(name + suffix)]
 
 

@@ -30,7 +30,7 @@ from hil.study.reproduce import evaluate, summary
 from hil.study.runs import all_cores
 
 ROOT = Path(__file__).parents[2]
-PICTURES = {"figure_5", "figure_6", "figure_7", "figure_8", "rivals", "comparison"}
+PICTURES = {"figure_5", "figure_6", "figure_7", "figure_8", "rivals", "comparison", "stability"}
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +93,8 @@ def test_figures_are_those_of_a_run_over_the_bus(tables, scenario):
     result = played(scenario).result
     ours = tables["scenarios"][scenario]["ours"]["ADRC"]
     assert ours["untrue"] == ""
-    for metric, (_, decimals) in METRICS.items():
-        assert ours[metric] == round(result[metric], decimals)
+    for metric in METRICS:
+        assert ours[metric] == pytest.approx(result[metric], rel=1e-4)
 
 
 def test_everyone_takes_part_and_a_new_tuning_by_itself(tables, monkeypatch):
@@ -147,13 +147,30 @@ def test_who_is_best_is_best_whoever_it_is():
         for label, rms_mm in {"P": 4.0, "PI": 3.0, "ADRC": 2.0, "rival": 1.0}.items()
     }
     taking_part = (*contestants()[:3], Contestant("rival", "pi_star", "pi"))
-    tables = tables_of(made_up, taking_part, ["sine"])
+    tables = tables_of(taking_part, ["sine"], made_up, {}, {})
     assert tables["scenarios"]["sine"]["best"] == {
         "rms_mm": ["rival"],
         "max_mm": ["P", "PI", "ADRC", "rival"],
         "chatter_rpm_per_period": ["P", "PI", "ADRC", "rival"],
     }
     assert tables["best_counts"] == {"P": 2, "PI": 2, "ADRC": 2, "rival": 3}
+
+
+def test_the_sweep_is_what_the_command_gives(tables, tmp_path, capsys):
+    sweep = ["sweep", "sine", "--samples", "64", "--tuning", "paper", "--json", "--out", str(tmp_path)]
+    assert cli.main(sweep) == 0
+    alone = json.loads(capsys.readouterr().out)
+    ours = tables["robustness"]["contestants"]["ADRC"]
+    assert ours["failures"] == alone["failures"]
+    for key in ("median", "p95", "worst"):
+        assert ours["rms_mm"][key] == pytest.approx(alone["rms_mm"][key], rel=1e-4)
+
+
+def test_stability_is_judged_for_everyone_from_end_to_end(tables):
+    assert list(tables["stability"]) == list(tables["contestants"])
+    for one in tables["stability"].values():
+        assert one["machines"] == 27
+        assert (one["unstable_machines"] > 0) == (one["largest_spectral_radius"] >= 1.0)
 
 
 # the report
