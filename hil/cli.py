@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
@@ -76,6 +77,9 @@ def main(argv: list[str] | None = None) -> int:
     except REFUSALS as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
+    except BrokenExecutor as error:
+        print(f"hil: a worker process was lost: {error}", file=sys.stderr)
+        return EXIT_BROKEN
     return code
 
 
