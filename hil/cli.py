@@ -5,7 +5,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
@@ -77,8 +77,8 @@ def main(argv: list[str] | None = None) -> int:
     except REFUSALS as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
-    except BrokenProcessPool:
-        print("hil: a worker process was lost (out of memory?): run it again", file=sys.stderr)
+    except BrokenExecutor as error:
+        print(f"hil: a worker process was lost: {error}", file=sys.stderr)
         return EXIT_BROKEN
     return code
 

@@ -128,10 +128,14 @@ def _spread(values: np.ndarray, sampled: bool) -> dict[str, float | None]:
     from scipy.stats import quantile_test
 
     interval = quantile_test(values, p=0.5).confidence_interval(CONFIDENCE) if sampled else (np.nan, np.nan)
-    with np.errstate(invalid="ignore"):  # between infinities
-        median, p95 = np.quantile(values, (0.5, 0.95))
-    spread = {"median": median, "median_low": interval[0], "median_high": interval[1], "p95": p95}
-    return {name: _finite(value) for name, value in (spread | {"worst": values.max()}).items()}
+    spread = {
+        "median": np.median(values),
+        "median_low": interval[0],
+        "median_high": interval[1],
+        "p95": np.quantile(values, 0.95, method="higher"),  # no mean with an infinity
+        "worst": values.max(),
+    }
+    return {name: _finite(value) for name, value in spread.items()}
 
 
 def _finite(value: float) -> float | None:

@@ -34,8 +34,8 @@ def add_command(commands: Any) -> None:
     sweep = commands.add_parser(
         "sweep",
         help="play scenarios on many machines of a box",
-        usage="hil sweep SCENARIO... [options]   (names as in `hil list`, or .toml files)",
-        epilog="exit codes: 0 played, however many samples failed; 2 wrong input; 130 interrupted",
+        usage="hil sweep SCENARIO... [options]   (names as in `hil list`, or .toml)",
+        epilog="exit codes: 0 played, whatever failed; 2 wrong input; 3 lost a process; 130 interrupted",
         formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=40),
     )
     sweep.set_defaults(command=run_command)
