@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shlex
 import signal
 import sys
@@ -324,3 +325,19 @@ def test_without_dask_the_cluster_option_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(BenchError, match=r"pip install 'ddh-hil\[cluster\]'"), dask_cluster("tcp://x"):
         pass
+
+
+def test_the_example_in_the_documentation_runs(capsys):
+    page = (Path(__file__).parents[3] / "docs/studies.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(example.replace("samples(20", "samples(2"), "docs/studies.md", "exec"), {})
+    assert capsys.readouterr().out.rstrip().endswith("of 2 fail")
+
+
+def test_the_documentation_shows_the_keys_and_ranges_of_the_built_in_box():
+    page = (Path(__file__).parents[3] / "docs/studies.md").read_text(encoding="utf-8")
+    shown = {
+        key: (float(low), float(high))
+        for key, low, high in re.findall(r"^\| `(\w+)` \|.*\| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
+    }
+    assert shown == dict(load_box().ranges)
