@@ -229,7 +229,9 @@ def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
 
 
 def _table(result: dict[str, Any]) -> Table:
-    table = Table(title=f"{result['scenario']}, {result['controller']}, {result['mode']}")
+    table = Table(
+        title=f"{result['scenario']}, {result['controller']} ({result['tuning']}), {result['mode']}"
+    )
     table.add_column("")
     table.add_column("this run", justify="right")
     table.add_column("limit", justify="right")

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shlex
 import signal
 import sys
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess as Process
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -223,7 +225,12 @@ def test_a_dask_cluster_gives_the_same_files(tmp_path, quickly):
     distributed = pytest.importorskip("distributed")
     swept(tmp_path / "here", *SHORT)
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, memory_limit=None
+        n_workers=2,
+        threads_per_worker=1,
+        memory_limit=None,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        scheduler_kwargs={"dashboard": False},
     ) as cluster:
         assert cluster.scheduler_address.startswith("tcp://127.0.0.1:")
         swept(tmp_path / "cluster", *SHORT, "--cluster", cluster.scheduler_address)
@@ -320,7 +327,41 @@ def test_a_cluster_that_is_not_there(capsys, tmp_path, monkeypatch):
     assert len(said.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("sources", "what"),
+    [
+        ({}, "has no workers"),
+        ({"tcp://127.0.0.1:1": "another"}, "worker tcp://127.0.0.1:1 has other sources of ddh-hil"),
+    ],
+)
+def test_a_cluster_that_would_not_compute_the_same_is_refused(capsys, tmp_path, monkeypatch, sources, what):
+    distributed = pytest.importorskip("distributed")
+    client = MagicMock()
+    client.return_value.run.return_value = sources
+    monkeypatch.setattr(distributed, "Client", client)
+    arguments = [*SHORT, "--cluster", "tcp://127.0.0.1:2", "--out", str(tmp_path / "out")]
+    assert cli.main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert what in line
+
+
 def test_without_dask_the_cluster_option_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(BenchError, match=r"pip install 'ddh-hil\[cluster\]'"), dask_cluster("tcp://x"):
         pass
+
+
+def test_the_example_in_the_documentation_runs(capsys):
+    page = (Path(__file__).parents[3] / "docs/studies.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(example.replace("samples(20", "samples(2"), "docs/studies.md", "exec"), {})
+    assert capsys.readouterr().out.rstrip().endswith("of 2 fail")
+
+
+def test_the_documentation_shows_the_keys_and_ranges_of_the_built_in_box():
+    page = (Path(__file__).parents[3] / "docs/studies.md").read_text(encoding="utf-8")
+    shown = {
+        key: (float(low), float(high))
+        for key, low, high in re.findall(r"^\| `(\w+)` \|.*\| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
+    }
+    assert shown == dict(load_box().ranges)
