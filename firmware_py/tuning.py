@@ -148,6 +148,15 @@ P = PiTuning(31_100.0)
 PI = PiTuning(27_270.0, 39_900.0)
 PI_STAR = PiTuning(20_853.0, 513_300.0)
 ADRC = AdrcTuning()
+LINEAR = AdrcTuning(  # bandwidths optimised under Ms <= 2, see hil.study.rivals
+    omega_o_rad_s=201.0,
+    omega_c_rad_s=215.0,
+    eso_delta_m=0.99,
+    delta1_m=0.99,
+    delta2_m_s=7.8,
+    delta3_m_s2=1950.0,
+)
+"""ADRC in a linear zone so wide that it never leaves it."""
 
 
 def _gain(index: int, factor: float) -> dict[int, int]:
@@ -345,5 +354,9 @@ def _scheduled_feedback(scheduled: ScheduledTuning) -> dict[int, int]:
     )
 
 
-TUNINGS = {"paper": Tuning(), "pi_star": Tuning(law=k.LAW_PI, pi=PI_STAR)}
+TUNINGS = {
+    "paper": Tuning(),
+    "pi_star": Tuning(law=k.LAW_PI, pi=PI_STAR),
+    "linear": Tuning(adrc=LINEAR),
+}
 """The built-in calibrations by name; each has the law it is named for as its default."""

@@ -67,9 +67,7 @@ def law_step(calibration: Array32, state: Array32, setpoint: int32, position: in
     if state[ST_LAW] == LAW_P:
         return p_step(calibration, setpoint, position)
     if state[ST_LAW] == LAW_SCHEDULED:
-        return command_filter_step(
-            calibration, state, scheduled_step(calibration, state, setpoint, position)
-        )
+        return command_filter_step(calibration, state, scheduled_step(calibration, state, setpoint, position))
     if state[ST_LAW] == LAW_PI_FF:
         return command_filter_step(calibration, state, pi_ff_step(calibration, state, setpoint, position))
     return 0

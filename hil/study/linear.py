@@ -1,18 +1,27 @@
 """The sampled loop, linearised: plant, delay and control law at one position, their eigenvalues and Ms.
 
 What is outside the feedback (differentiator, setpoint limiter, feed-forward) is left out; so are quantisation
-and the limits of drive and motor. fal counts with slope 1, its linear zone: beyond it its gain falls, so that
-a verdict holds for small signals only. A loop that is stable here may cycle at large amplitude, one that is
-unstable here may settle on a small cycle.
+and the limits of drive, motor and command slew. fal counts with slope 1, its linear zone: beyond it its gain
+falls, so that a verdict holds for small signals only. A loop that is stable here may cycle at a large
+amplitude, one that is unstable here may settle on a small cycle.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from firmware_py.kernel import layout as k
-from firmware_py.tuning import PERIOD_S, AdrcTuning, PiTuning, Tuning
+from firmware_py.tuning import (
+    PERIOD_S,
+    AdrcTuning,
+    CommandFilterTuning,
+    FrontEndTuning,
+    PiTuning,
+    ScheduledTuning,
+    Tuning,
+)
 from plant_sim.derived import linearised, linearised_about, steady_motion
 from plant_sim.drive import MAX_DELAY_PERIODS
 from plant_sim.machine import Machine
@@ -148,8 +157,37 @@ def adrc_model(gains: AdrcTuning) -> StateSpace:
     return observer_with_feedback(observe, injection, feedback)
 
 
-def observer_with_feedback(observe: np.ndarray, injection: np.ndarray, feedback: np.ndarray) -> StateSpace:
-    """Return the controller whose command is `feedback` · z(k+1).
+def scheduled_model(
+    gains: ScheduledTuning, front_end: FrontEndTuning, command_filter: CommandFilterTuning, position_m: float
+) -> StateSpace:
+    """Return the scheduled observer, feedback and command filter from position (m) to command (rad/s).
+
+    b0, a1n and the gains that follow them are those at `position_m`; the speed per rod speed is the mean of
+    both directions. States: z1, z2, z3, the disturbance as a speed, the motor's model, and the command sent
+    last.
+    """
+    stiff = gains.stiffness(position_m)
+    b0 = gains.b0_m_s2_per_rad * stiff
+    kappa = (front_end.extend_rad_per_m + front_end.retract_rad_per_m) / 2
+    w_o = gains.omega_o_rad_s
+    motor = _lag_share(gains.motor_time_constant_s)
+    injection = PERIOD_S * np.array(
+        [4 * w_o, 6 * w_o**2, 4 * w_o**3, gains.omega_d_rad_s * w_o * (kappa + w_o**2 / b0), 0.0]
+    )
+    observe = np.eye(5, 6)
+    observe[:2, 1:3] += PERIOD_S * np.eye(2)
+    observe[4, 4:] = 1.0 - motor, motor
+    observe[2] += PERIOD_S * b0 * (observe[4] + np.array([0.0, -kappa, 0.0, 1.0, 0.0, 0.0]))
+    observe[:, 0] -= injection
+    damping = gains.k3_rad_s_per_m + gains.k3_soft_rad_s_per_m / stiff
+    feedback = -np.array([gains.k1_rad_s_per_m, gains.k2_rad_per_m, damping, 1.0, 0.0])
+    return observer_with_feedback(observe, injection, feedback, _lag_share(command_filter.time_constant_s))
+
+
+def observer_with_feedback(
+    observe: np.ndarray, injection: np.ndarray, feedback: np.ndarray, share: float = 1.0
+) -> StateSpace:
+    """Return the controller whose command follows `feedback` · z(k+1), and whose observer is fed the command.
 
     Parameters
     ----------
@@ -158,20 +196,41 @@ def observer_with_feedback(observe: np.ndarray, injection: np.ndarray, feedback:
     injection : ndarray, shape (n,)
         z(k+1) from the position measured at k.
     feedback : ndarray, shape (n,)
-        Command from z(k+1).
+        Wanted command from z(k+1).
+    share : float
+        Share of the way from the last command to the wanted one, 1 without a low-pass.
     """
+    command = share * (feedback @ observe)
+    command[-1] += 1.0 - share
+    direct = share * (feedback @ injection)
+    return StateSpace(np.vstack([observe, command]), np.append(injection, direct), command, np.array(direct))
+
+
+def low_passed(model: StateSpace, command_filter: CommandFilterTuning) -> StateSpace:
+    """Return a controller with the command filter behind it; the last state is the command sent last."""
+    share = _lag_share(command_filter.time_constant_s)
+    command = np.append(share * model.c, 1.0 - share)
     return StateSpace(
-        a=np.vstack([observe, feedback @ observe]),
-        b=np.append(injection, feedback @ injection),
-        c=feedback @ observe,
-        d=np.array(feedback @ injection),
+        np.vstack([np.pad(model.a, ((0, 0), (0, 1))), command]),
+        np.append(model.b, share * model.d),
+        command,
+        share * model.d,
     )
+
+
+def _lag_share(time_constant_s: float) -> float:
+    """Return the share of a step that a first-order lag passes in a period."""
+    return -math.expm1(-PERIOD_S / time_constant_s) if time_constant_s else 1.0
 
 
 CONTROLLER_MODELS: dict[int, Callable[[Tuning, float], StateSpace]] = {
     k.LAW_P: lambda tuning, position_m: pi_model(tuning.p),
     k.LAW_PI: lambda tuning, position_m: pi_model(tuning.pi),
     k.LAW_ADRC: lambda tuning, position_m: adrc_model(tuning.adrc),
+    k.LAW_PI_FF: lambda tuning, position_m: low_passed(pi_model(tuning.pi), tuning.command_filter),
+    k.LAW_SCHEDULED: lambda tuning, position_m: scheduled_model(
+        tuning.scheduled, tuning.front_end, tuning.command_filter, position_m
+    ),
 }
 """From position (m) to command (rad/s), by law, for a tuning at a position (m)."""
 
