@@ -188,6 +188,14 @@ def tables_of(
             for one in taking_part
         },
         "scenarios": scenario_tables,
+        "adrc_ahead_counts": {
+            one.label: sum(
+                table["ours"]["ADRC"]["rms_mm"] < table["ours"][one.label]["rms_mm"]
+                for table in scenario_tables.values()
+            )
+            for one in taking_part
+            if one.label != "ADRC"
+        },
         "best_counts": {one.label: best.count(one.label) for one in taking_part},
         "load_effect_percent": {
             name: _load_effect(runs, name, loaded)
@@ -197,6 +205,7 @@ def tables_of(
         "robustness": {
             "scenario": SWEPT,
             "samples": SAMPLES,
+            "box": {key: list(ends) for key, ends in load_box().ranges.items()},
             "failed_above_mm": FAILED_RMS_MM,
             "contestants": {
                 label: {key: summary[key] for key in ("failures", "rms_mm", "chatter_rpm")}
@@ -212,6 +221,8 @@ def _shortened(value: Any) -> Any:
     """Return nested figures with `DIGITS` significant digits."""
     if isinstance(value, Mapping):
         return {key: _shortened(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_shortened(inner) for inner in value]
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 

@@ -1,6 +1,7 @@
 """The evaluation's figures. Imports matplotlib; import it only where something is drawn."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,16 @@ BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (  # Okabe and Ito, told ap
     "#cc79a7",
 )
 GREY = "#9a9a9a"
-_STYLES = {"P": (PURPLE, "-"), "PI": (ORANGE, "-"), "ADRC": (BLUE, "-")}
-_MORE_STYLES = ((SKY, "-"), (GREEN, "-"), (BLACK, "-"), (VERMILION, "-"), (GREY, "-"), (GREEN, "--"))
+_COLOURS = {
+    "P": PURPLE,
+    "PI": ORANGE,
+    "ADRC": BLUE,
+    "PI*": GREEN,
+    "PI+FF": BLACK,
+    "linear ADRC": SKY,
+    "robust ADRC": VERMILION,
+}
+_MORE_COLOURS = (GREY, "#5d3a9b", "#7f6000", "#994f00")
 _DRAWN_BINS = 900
 _WIDTH_IN = 8.5
 _PANEL_IN = 1.7
@@ -59,10 +68,10 @@ def save(directory: Path, name: str, draw: Draw) -> list[Path]:
     return paths
 
 
-def styles(taking_part: Sequence[Contestant]) -> dict[str, tuple[str, str]]:
-    """Return colour and line style of each contestant by label."""
-    others = (one.label for one in taking_part if one.label not in _STYLES)
-    return _STYLES | dict(zip(others, _MORE_STYLES, strict=False))
+def colours(taking_part: Sequence[Contestant]) -> dict[str, str]:
+    """Return a colour for each contestant, by label."""
+    others = (one.label for one in taking_part if one.label not in _COLOURS)
+    return _COLOURS | dict(zip(others, cycle(_MORE_COLOURS), strict=False))
 
 
 def tracking(traces: Mapping[str, Trace]) -> Draw:
@@ -115,15 +124,14 @@ def tracking(traces: Mapping[str, Trace]) -> Draw:
 
 def rivals(names: Sequence[str], runs: Runs, taking_part: Sequence[Contestant]) -> Draw:
     """Return what draws the error of all contestants but P and PI, a panel for each scenario."""
-    style = styles(taking_part)
+    colour = colours(taking_part)
 
     def panel_of(name: str) -> Callable[[Axes], None]:
         def panel(axes: Axes) -> None:
             for one in taking_part:
                 if one.label not in ("P", "PI"):
                     trace = runs[name, one.label].trace
-                    colour, line = style[one.label]
-                    _line(axes, trace, trace["error_m"] * M_TO_MM, one.label, colour, ls=line, lw=0.9)
+                    _line(axes, trace, trace["error_m"] * M_TO_MM, one.label, colour[one.label], lw=0.9)
             axes.set_ylabel("error / mm")
             axes.set_title(name, loc="left", fontsize=9)
             if name == names[0]:
@@ -136,7 +144,7 @@ def rivals(names: Sequence[str], runs: Runs, taking_part: Sequence[Contestant]) 
 
 def comparison(tables: dict[str, Any], taking_part: Sequence[Contestant]) -> Draw:
     """Return what draws RMS and maximum error of all contestants beside the paper's, on a log scale."""
-    style = styles(taking_part)
+    colour = colours(taking_part)
     scenarios = tables["scenarios"]
 
     def draw(figure: Figure) -> None:
@@ -150,11 +158,10 @@ def comparison(tables: dict[str, Any], taking_part: Sequence[Contestant]) -> Dra
                 offset = (row - (len(taking_part) - 1) / 2) * 0.8 / len(taking_part)
                 y = np.arange(len(scenarios)) + offset
                 ours = [table["ours"][one.label][metric] for table in scenarios.values()]
-                colour, _ = style[one.label]
-                axes.plot(ours, y, "o", color=colour, ms=5, label=one.label)
+                axes.plot(ours, y, "o", color=colour[one.label], ms=5, label=one.label)
                 if one.in_paper:
                     theirs = [table["paper"][one.law][metric] for table in scenarios.values()]
-                    axes.plot(theirs, y, "D", color=colour, mfc="none", ms=5)
+                    axes.plot(theirs, y, "D", color=colour[one.label], mfc="none", ms=5)
             axes.plot([], [], "D", color=BLACK, mfc="none", ms=5, label="paper")
             axes.set_xscale("log")
             axes.set_xlabel(title)
@@ -186,7 +193,7 @@ def _stacked(panels: Sequence[Callable[[Axes], None]], lettered: bool = True) ->
 
 def _line(axes: Axes, trace: Trace, values: np.ndarray, label: str, colour: str = "", **style: Any) -> None:
     time_s, drawn = _thinned(trace["time_s"], values)
-    axes.plot(time_s, drawn, color=colour or _STYLES[label][0], label=label, **style)
+    axes.plot(time_s, drawn, color=colour or _COLOURS[label], label=label, **style)
 
 
 def _thinned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

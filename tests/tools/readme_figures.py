@@ -39,6 +39,9 @@ def table() -> str:
         )
     chatter = {label: figures[CHATTER] for label, figures in scenarios["sine"]["ours"].items()}
     rows.append(["speed chatter on the sine, rpm per ms", *(f"{value:.1f}" for value in chatter.values())])
+    robustness = tables["robustness"]
+    failures = [one["failures"] for one in robustness["contestants"].values()]
+    rows.append([f"failures of {robustness['samples']} other machines", *map(str, failures)])
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
