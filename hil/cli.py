@@ -136,6 +136,8 @@ def _run(arguments: argparse.Namespace) -> int:
     bus = arguments.interface, arguments.channel, arguments.bitrate
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
+    if arguments.mode != "realtime" and arguments.rt_ratio != 1:
+        raise BenchError("--rt-ratio needs --mode realtime: virtual time has no pace")
     if arguments.interface is not None:
         bus = bus_settings(*bus)
     interface, channel, bit_rate = bus
