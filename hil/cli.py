@@ -204,8 +204,9 @@ def _table(result: dict[str, Any]) -> Table:
     table.add_column("this run", justify="right")
     table.add_column("limit", justify="right")
     table.add_column("paper", justify="right")
+    judged = (result["limits"], result["paper"]) if result["complete"] else (None, None)
     for key, label in (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")):
-        limit, paper = ((source or {}).get(key) for source in (result["limits"], result["paper"]))
+        limit, paper = ((source or {}).get(key) for source in judged)
         table.add_row(label, *(_number(value, ".4f") for value in (result[key], limit, paper)))
     latency = result["timing"]["latency_us"]
     rows = (
@@ -213,6 +214,8 @@ def _table(result: dict[str, Any]) -> Table:
         ("bus load / %", _number(result["bus_load_percent"], ".1f")),
         ("feedback to command, median / µs", _number(latency["p50"], ".0f")),
         ("feedback to command, maximum / µs", _number(latency["max"], ".0f")),
+        ("missed periods", str(result["timing"]["missed_periods"])),
+        ("late periods", str(result["timing"]["late_periods"])),
         ("start-up / s", _number(result["startup_s"], ".1f")),
         ("times real time", _number(result["realtime_factor"], ".1f")),
     )
