@@ -37,6 +37,7 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
+from hil.study import rta
 from hil.supervisor import BRING_UP_S
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
@@ -109,6 +110,8 @@ def _parser() -> argparse.ArgumentParser:
     questions = vcan.add_subparsers(required=True, metavar="QUESTION")
     status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
     status.set_defaults(command=_vcan_status)
+
+    rta.add_command(commands)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)
