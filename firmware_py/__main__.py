@@ -4,8 +4,8 @@ import argparse
 import sys
 
 from dbc.contract import Contract
+from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from firmware_py.node import PHASE_NS, Controller
-from firmware_py.tuning import Tuning
 from hil.bus.wire import Clock
 from hil.run.node_process import add_node_arguments, node_main
 
@@ -16,9 +16,10 @@ def main(argv: list[str] | None = None) -> int:
     """Run the controller until it is stopped."""
     parser = argparse.ArgumentParser(prog="python -m firmware_py", description=DESCRIPTION)
     add_node_arguments(parser)
+    add_tuning_arguments(parser)
 
     def build(arguments: argparse.Namespace) -> Controller:
-        return Controller(Contract.load(arguments.dbc), Tuning().calibration().to_bytes())
+        return Controller(Contract.load(arguments.dbc), tuning_of(arguments).calibration.to_bytes())
 
     return node_main(parser, build, Clock(PHASE_NS), argv)
 

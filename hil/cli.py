@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dbc.contract import ContractError
+from firmware_py.calibration import CalibrationError
+from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
@@ -37,12 +40,26 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
-from hil.study import rta
+from hil.study import rta_command, sweep_command
+from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
+from plant_sim.parameters import ParameterError
 
 EXIT_OK, EXIT_LIMITS, EXIT_USAGE, EXIT_BROKEN = range(4)
 EXIT_UNUSABLE = 1
 EXIT_INTERRUPTED = 128 + signal.SIGINT
+
+REFUSALS = (
+    BenchError,
+    BoxError,
+    CalibrationError,
+    can.CanInitializationError,
+    ContractError,
+    LinkError,
+    ParameterError,
+    ScenarioError,
+)
+"""What is wrong at the door: one line, exit code 2."""
 
 EXIT_CODES = """exit codes: 0 played and within the scenario's limits; 1 played, limits missed;
 2 wrong input or no answer; 3 a process was lost; 130 interrupted"""
@@ -56,7 +73,7 @@ def main(argv: list[str] | None = None) -> int:
     except InterruptedRunError as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except (BenchError, ScenarioError, ContractError, LinkError, can.CanInitializationError) as error:
+    except REFUSALS as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
     return code
@@ -72,13 +89,16 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "run",
         help="play a scenario",
-        usage="hil run SCENARIO [options]",
+        usage="hil run SCENARIO [options]   (name as in `hil list`, or .toml file)",
         epilog=EXIT_CODES,
         formatter_class=_OneLineEach,
     )
     run.set_defaults(command=_run)
-    run.add_argument("scenario", metavar="SCENARIO", help="name (see `hil list`) or .toml file")
-    run.add_argument("--controller", choices=CONTROLLERS, default="adrc", help="control law (default adrc)")
+    run.add_argument("scenario", help=argparse.SUPPRESS)
+    laws = ", ".join(CONTROLLERS)
+    run.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (default: tuning's)")
+    add_tuning_arguments(run)
+    run.add_argument("--machine", metavar="K=V,...", help="differing machine: mass=1.5,leak=2 ...")
     run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
@@ -98,6 +118,8 @@ def _parser() -> argparse.ArgumentParser:
         "--answer-timeout", type=_seconds, default=10.0, metavar="S", help="for a node to answer"
     )
 
+    sweep_command.add_command(commands)
+
     bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
     bus.set_defaults(command=_bus)
     bus.add_argument("--channel", required=True, help="name to attach to: -i hilbus -c NAME")
@@ -111,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
     status.set_defaults(command=_vcan_status)
 
-    rta.add_command(commands)
+    rta_command.add_command(commands)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)
@@ -134,6 +156,8 @@ def _seconds(text: str) -> float:
 
 def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
+    if arguments.machine is not None:
+        scenario = replace(scenario, machine=scenario.machine.with_text(arguments.machine))
     if arguments.bitrate is not None:
         check_bit_rate(arguments.bitrate)
     bus = arguments.interface, arguments.channel, arguments.bitrate
@@ -151,7 +175,8 @@ def _run(arguments: argparse.Namespace) -> int:
         with _progress(console, scenario.name, scenario.duration_s + BRING_UP_S) as progress:
             options = RunOptions(
                 scenario=scenario,
-                controller=arguments.controller,
+                controller=arguments.controller or "",
+                tuning=tuning_of(arguments),
                 record_directory=folder.scratch,
                 bit_rate=bit_rate,
                 dbc=arguments.dbc,

@@ -1,7 +1,6 @@
 """The closed loop without the bus: kernel and plant in one compiled loop, on the bus run's timing chart."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,21 +18,28 @@ from firmware_py.kernel.layout import (
     IO_TARGET_VELOCITY,
     ST_SIZE,
 )
-from hil.references import SETPOINT_LSB_M
+from hil.references import SETPOINT_LSB_M, setpoint_counts
+from hil.scenario import Scenario
+from hil.supervisor import BRING_UP_PERIODS
+from plant_sim.drive import COUNTS_PER_RPM, RAD_S_PER_COUNT
 from plant_sim.equilibrium import initial_state
 from plant_sim.integrator import advance
 from plant_sim.layout import POSITION
+from plant_sim.machine import Machine
 from plant_sim.parameters import PlantParameters
 from plant_sim.period import PERIOD_S, SUBSTEPS
+from plant_sim.sensors import quantised_um
 
-VELOCITY_LSB_RPM = 0.25
-RAD_S_PER_COUNT = math.pi / 120
-MICROMETRES_PER_METRE = 1e6
+RUNNING_BEFORE_START_PERIODS = 58
+"""How long the controller has been in Run when a scenario starts, on a bus at 1 Mbit/s.
+
+It follows from the supervisor's bring-up: tests/hil/study/test_loop_and_bus.py compares.
+"""
 
 
 @njit(
     "void(int32[::1], int32[::1], int32[::1], float64[::1], float64[::1], int32[::1], float64[::1],"
-    " int64, int64, int64, float64[::1], int32[::1], int32[::1], int32[:,::1])",
+    " int64, int64, int64, int64, float64[::1], int32[::1], int32[::1], int32[:,::1])",
     depends=("firmware_py.compiled", "firmware_py.kernel", "plant_sim"),
 )
 def _run(  # type: ignore[no-untyped-def]
@@ -47,6 +53,7 @@ def _run(  # type: ignore[no-untyped-def]
     position_lsb_um,
     delay_periods,
     hold_periods,
+    speed_limit,
     position,
     velocity,
     flags,
@@ -57,8 +64,7 @@ def _run(  # type: ignore[no-untyped-def]
     for tick in range(-hold_periods, setpoint.size):
         k = max(tick, 0)
         position[k] = plant[POSITION]
-        count = math.floor(plant[POSITION] * MICROMETRES_PER_METRE / position_lsb_um + 0.5)
-        io[IO_POSITION] = count * position_lsb_um
+        io[IO_POSITION] = quantised_um(plant[POSITION], position_lsb_um)
         io[IO_SETPOINT] = setpoint[k]
         if tick == -hold_periods:
             control_reset(calibration, state, io)
@@ -68,8 +74,9 @@ def _run(  # type: ignore[no-untyped-def]
         states[k] = state
         slot = (tick + hold_periods) % delay_periods
         held = pending[slot]
-        pending[slot] = io[IO_TARGET_VELOCITY]
-        advance(plant, parameters, held * RAD_S_PER_COUNT, load[k], PERIOD_S, SUBSTEPS)
+        pending[slot] = min(max(io[IO_TARGET_VELOCITY], -speed_limit), speed_limit)
+        load_n = load[k] if tick >= 0 else 0.0
+        advance(plant, parameters, held * RAD_S_PER_COUNT, load_n, PERIOD_S, SUBSTEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,12 +114,12 @@ class ClosedLoopRun:
     @property
     def rms_mm(self) -> float:
         """RMS of the error over the run."""
-        return float(np.sqrt(np.mean(self.error_m**2))) * 1e3
+        return float(np.sqrt(np.mean((self.error_m * 1e3) ** 2)))
 
     @property
     def max_mm(self) -> float:
         """Largest error magnitude."""
-        return float(np.max(np.abs(self.error_m))) * 1e3
+        return float(np.max(np.abs(self.error_m * 1e3)))
 
     @property
     def chatter_rpm(self) -> float:
@@ -130,6 +137,7 @@ def run_closed_loop(
     position_lsb_um: int = 1,
     delay_periods: int = 1,
     hold_periods: int = 0,
+    plant: np.ndarray | None = None,
 ) -> ClosedLoopRun:
     """Run kernel and plant over a whole reference.
 
@@ -152,7 +160,10 @@ def run_closed_loop(
     delay_periods : int
         Transport delay, at least 1.
     hold_periods : int
-        Periods at the first setpoint and load before k = 0.
+        Periods at the first setpoint, without load, before k = 0.
+    plant : ndarray, optional
+        State of the plant at the beginning, see `plant_sim.layout`; at rest, retracted, if not given. It is
+        advanced in place.
     """
     if setpoint.shape != load_n.shape or delay_periods < 1 or position_lsb_um < 1 or hold_periods < 0:
         raise ValueError("closed loop: setpoint and load differ in length, or an option is out of range")
@@ -167,13 +178,14 @@ def run_closed_loop(
         calibration.array(),
         np.zeros(ST_SIZE, np.int32),
         io,
-        initial_state(parameters),
+        initial_state(parameters) if plant is None else plant,
         parameters.vector(),
         np.ascontiguousarray(setpoint, np.int32),
         np.ascontiguousarray(load_n, np.float64),
         position_lsb_um,
         delay_periods,
         hold_periods,
+        int(parameters.motor_speed_rpm * COUNTS_PER_RPM),
         position,
         velocity,
         flags,
@@ -182,8 +194,51 @@ def run_closed_loop(
     return ClosedLoopRun(
         reference_m=setpoint * SETPOINT_LSB_M,
         position_m=position,
-        command_rpm=velocity * VELOCITY_LSB_RPM,
+        command_rpm=velocity / COUNTS_PER_RPM,
         flags=flags,
         states=states,
         saturations=int(io[IO_SATURATIONS]),
     )
+
+
+def play_closed_loop(
+    scenario: Scenario,
+    calibration: Calibration,
+    *,
+    law: int | None = None,
+    machine: Machine | None = None,
+) -> ClosedLoopRun:
+    """Play a scenario as a run over the bus at 1 Mbit/s does: same commands, same positions, bit for bit.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    calibration : Calibration
+    law : int, optional
+        Control law, instead of the calibration's default.
+    machine : Machine, optional
+        Instead of the scenario's.
+
+    Returns
+    -------
+    run : ClosedLoopRun
+        Its `reference_m` is the scenario's, not rounded.
+    """
+    machine = machine or scenario.machine
+    parameters, reference_m = machine.parameters, scenario.reference_m()
+    setpoint = setpoint_counts(reference_m)
+    plant = initial_state(parameters, min(max(setpoint[0] * SETPOINT_LSB_M, 0.0), parameters.stroke_m))
+    for _ in range(BRING_UP_PERIODS - RUNNING_BEFORE_START_PERIODS):
+        advance(plant, parameters.vector(), 0.0, 0.0, PERIOD_S, SUBSTEPS)
+    run = run_closed_loop(
+        calibration,
+        setpoint,
+        scenario.load_n(),
+        law=law,
+        parameters=parameters,
+        position_lsb_um=machine.position_lsb_um,
+        delay_periods=machine.delay_periods,
+        hold_periods=RUNNING_BEFORE_START_PERIODS,
+        plant=plant,
+    )
+    return replace(run, reference_m=reference_m)

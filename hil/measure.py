@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from firmware_py.node import PHASE_NS
 from firmware_py.state_machine import State
 from firmware_py.task import Fault
 from hil.bus.wire_time import traffic_bits
-from hil.run.options import Recording, RunOptions
+from hil.run.options import Recording, RigOptions, RunOptions
 from hil.scenario import PERIOD_S, TimingLimits
 from hil.signals import Series, signal_of
 from hil.supervisor import BRING_UP_PERIODS
@@ -134,6 +135,11 @@ def figures_of(
     }
 
 
+def setting_of(options: RigOptions) -> dict[str, Any]:
+    """Return what the firmware was calibrated with and what the plant was."""
+    return {"tuning": options.tuning.name, "machine": asdict(options.machine)}
+
+
 def result_of(
     recording: Recording, trace: Trace, contract: Contract, options: RunOptions, mode: str
 ) -> dict[str, Any]:
@@ -149,6 +155,7 @@ def result_of(
     return {
         "scenario": scenario.name,
         "controller": options.controller,
+        **setting_of(options),
         **figures,
         "limits": limits,
         "timing_limits": scenario.timing.given() or None,

@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import can
 import numpy as np
@@ -20,8 +20,56 @@ from hil.run.options import BenchError
 BLUE, ORANGE, GREY, RED = "#0b5394", "#d9730d", "#8a8a8a", "#b02a30"
 
 
-class OutputDirectory:
-    """A run's folder: files are made beside it and moved in at the end, so that none is ever half-written.
+class ResultFolder:
+    """A folder whose files are made beside it and moved in at the end, so that none is ever half-written.
+
+    Parameters
+    ----------
+    path : Path
+        The folder; made if it is missing.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+    scratch : Path
+        Where the files are made.
+
+    Raises
+    ------
+    BenchError
+        If the folder cannot be written to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._made = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self.scratch = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=path))
+        except OSError as error:
+            raise BenchError(f"cannot write to {path} ({error.strerror}): choose another --out") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._clean_up()
+
+    def move_in(self, made: list[Path]) -> list[Path]:
+        """Move files from the scratch folder in and return their paths."""
+        return [file.replace(self.path / file.name) for file in made]
+
+    def _clean_up(self) -> None:
+        """Remove what is not a result, folders made for nothing included."""
+        shutil.rmtree(self.scratch, ignore_errors=True)
+        with suppress(OSError):  # the first folder that holds something ends it
+            for folder in self._made:
+                folder.rmdir()
+
+
+class OutputDirectory(ResultFolder):
+    """A run's folder.
 
     Parameters
     ----------
@@ -40,25 +88,13 @@ class OutputDirectory:
         if log_format not in MESSAGE_WRITERS:
             known = ", ".join(sorted(MESSAGE_WRITERS))
             raise BenchError(f"no bus log can be written as {log_format!r}: choose one of {known}")
-        self.path = path
+        super().__init__(path)
         self._log_format = log_format
-        self._made = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self.scratch = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=path))
-        except OSError as error:
-            raise BenchError(f"cannot write to {path} ({error.strerror}): choose another --out") from error
         try:
             write_bus_log(self.scratch / f"probe{log_format}", np.empty((0, 4), np.uint64))
         except (ImportError, NotImplementedError) as error:  # a package that this format needs is missing
             self._clean_up()
             raise BenchError(f"no bus log can be written as {log_format!r}: {error}") from error
-
-    def __enter__(self) -> "OutputDirectory":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._clean_up()
 
     def write(self, result: dict[str, Any], trace: Trace, traffic: np.ndarray) -> list[Path]:
         """Write all files and return their paths."""
@@ -80,16 +116,7 @@ class OutputDirectory:
         for old in self.path.glob("bus.*"):
             if old.suffix in MESSAGE_WRITERS:
                 old.unlink()
-        for file in made:
-            os.replace(file, self.path / file.name)
-        return [self.path / file.name for file in made]
-
-    def _clean_up(self) -> None:
-        """Remove what is not a result, folders made for nothing included."""
-        shutil.rmtree(self.scratch, ignore_errors=True)
-        with suppress(OSError):  # the first folder that holds something ends it
-            for folder in self._made:
-                folder.rmdir()
+        return self.move_in(made)
 
 
 def write_bus_log(path: Path, traffic: np.ndarray) -> None:

@@ -11,10 +11,17 @@ import numpy as np
 
 from dbc.node import PERIOD_NS
 from hil.references import REFERENCES
+from plant_sim.machine import Machine
+from plant_sim.parameters import ParameterError
 
 CONTROLLERS = ("p", "pi", "adrc")
 PERIOD_S = PERIOD_NS * 1e-9
 MAX_LOAD_N = 1e6
+
+
+def controller_of(law: int) -> str:
+    """Return the name of a control law by its number on the bus."""
+    return CONTROLLERS[law - 1]
 
 
 class ScenarioError(ValueError):
@@ -63,6 +70,8 @@ class Scenario:
         The paper's figures for each controller, `rms_mm` and `max_mm`; empty if it has none.
     timing : TimingLimits
         Limits on the timing, whichever controller is played.
+    machine : Machine
+        What it is played on.
     """
 
     name: str
@@ -73,6 +82,7 @@ class Scenario:
     limits: dict[str, dict[str, float]]
     paper: dict[str, dict[str, float]]
     timing: TimingLimits = field(default_factory=TimingLimits)
+    machine: Machine = field(default_factory=Machine)
 
     @property
     def periods(self) -> int:
@@ -91,6 +101,18 @@ class Scenario:
     def position_m(self, time_s: np.ndarray) -> np.ndarray:
         """Return the reference at given times from its start, m."""
         return REFERENCES[self.reference](time_s)
+
+    @property
+    def load_changes(self) -> list[tuple[int, int]]:
+        """The load steps as they go over the bus: period in which each begins, and force in whole N."""
+        return [(round(time_s * 1e9) // PERIOD_NS, round(force_n)) for time_s, force_n in self.load]
+
+    def load_n(self) -> np.ndarray:
+        """Return the load that acts in each period, N."""
+        load_n = np.zeros(self.periods)
+        for period, force_n in sorted(self.load_changes, key=lambda change: change[0]):
+            load_n[period:] = force_n
+        return load_n
 
 
 def builtin_names() -> list[str]:
@@ -136,7 +158,7 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
 
 def _checked(name: str, content: dict[str, Any]) -> Scenario:
     required = {"title", "reference", "duration_s"}
-    optional = {"load", "limits", "paper", "timing"}
+    optional = {"load", "limits", "paper", "timing", "machine"}
     if missing := sorted(required - set(content)):
         raise ScenarioError(f"{name}: missing key {missing[0]!r}")
     if unknown := sorted(set(content) - required - optional):
@@ -174,6 +196,7 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
         limits=content.get("limits", {}),
         paper=content.get("paper", {}),
         timing=_timing_limits(name, content.get("timing", {})),
+        machine=_machine(name, content.get("machine", {})),
     )
 
 
@@ -190,6 +213,15 @@ def _timing_limits(name: str, table: Any) -> TimingLimits:
             kind = "whole number" if counted else "number of µs"
             raise ScenarioError(f"{name}: timing.{key} is {limit!r}, must be a {kind} from 0 on; {hint}")
     return TimingLimits(**table)
+
+
+def _machine(name: str, table: Any) -> Machine:
+    if not isinstance(table, dict):
+        raise ScenarioError(f"{name}: machine must be a table")
+    try:
+        return Machine.from_table(table)
+    except ParameterError as error:
+        raise ScenarioError(f"{name}: {error}") from error
 
 
 def _is_number(value: Any) -> bool:

@@ -107,8 +107,8 @@ class Supervisor:
     def plan_scenario(self, scenario: Scenario) -> None:
         """Plan a scenario's reference and loads, from the end of the bring-up on."""
         self.plan(BRING_UP_PERIODS, reference=scenario.position_m)
-        for time_s, force_n in scenario.load:
-            self.plan(BRING_UP_PERIODS + round(time_s * 1e9) // PERIOD_NS, load_n=round(force_n))
+        for period, force_n in scenario.load_changes:
+            self.plan(BRING_UP_PERIODS + period, load_n=force_n)
 
     def steer(self, **words: int | Reference) -> None:
         """Change something with the next period; see `plan`."""

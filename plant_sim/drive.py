@@ -4,12 +4,16 @@ The state machine is two tables: what a controlword means, and which transition 
 comments are CiA 402's transition numbers. A quick stop ramps down, then disables (option code 2); losing the
 command ramps down, then faults. Leaving Operation enabled any other way sets the speed command to zero at
 once, and the motor follows at its own acceleration limit.
+
+A drive may take its commands later than at the first cycle after their arrival: one or two cycles more, which
+they spend in a queue, periods without a command among them.
 """
 
 import math
 from enum import IntEnum
 
 import numpy as np
+from numba.extending import register_jitable
 
 from dbc.jit import njit
 
@@ -18,8 +22,10 @@ COUNTS_PER_RPM = 4
 PERIOD_S = 1e-3
 MISSED_COMMANDS_LIMIT = 3
 """Consecutive periods without a valid command that trip an enabled drive."""
+MAX_DELAY_PERIODS = 3
+"""Largest transport delay: commands wait for up to two cycles."""
 
-_RAD_S_PER_COUNT = math.pi / (30.0 * COUNTS_PER_RPM)
+RAD_S_PER_COUNT = math.pi / (30.0 * COUNTS_PER_RPM)
 
 
 class State(IntEnum):
@@ -121,13 +127,30 @@ _FAULT = int(State.FAULT)
     RESET_BIT,  # controlword bit 7 of the last command
     MAX_COUNTS,  # top speed, 0.25 rpm
     RAMP_COUNTS,  # slope of a stop, 0.25 rpm per period
-) = range(7)
-DRIVE_SIZE = 7
+    WAIT,  # cycles that a command waits
+    OLDEST,  # which of the waiting commands is the next to be taken
+    QUEUE,  # from here on the waiting commands: controlword, target, whether there is one
+) = range(10)
+_COMMAND_SIZE = 3
+DRIVE_SIZE = QUEUE + _COMMAND_SIZE * (MAX_DELAY_PERIODS - 1)
+
+
+@register_jitable
+def _after_waiting(drive, controlword, target, arrived):  # type: ignore[no-untyped-def]
+    """Put this period's command into the queue and return the one whose turn it is."""
+    if drive[WAIT] == 0:
+        return controlword, target, arrived
+    place = QUEUE + _COMMAND_SIZE * drive[OLDEST]
+    drive[OLDEST] = (drive[OLDEST] + 1) % drive[WAIT]
+    taken = drive[place], drive[place + 1], drive[place + 2]
+    drive[place], drive[place + 1], drive[place + 2] = controlword, target, arrived
+    return taken
 
 
 @njit("float64(int64[::1], int64, int64, int64)")
 def drive_step(drive, controlword, target, arrived):  # type: ignore[no-untyped-def]
     """Run one drive period on a drive's words; see `Drive.step`. `arrived` is 0 without a valid command."""
+    controlword, target, arrived = _after_waiting(drive, controlword, target, arrived)
     if drive[STATE] == _NOT_READY:
         drive[STATE] = _DISABLED  # 0, 1
     if arrived:
@@ -154,7 +177,7 @@ def drive_step(drive, controlword, target, arrived):  # type: ignore[no-untyped-
     elif arrived:
         drive[SPEED_COUNTS] = min(max(target, -drive[MAX_COUNTS]), drive[MAX_COUNTS])
         drive[LIMITED] = drive[SPEED_COUNTS] != target
-    return drive[SPEED_COUNTS] * _RAD_S_PER_COUNT
+    return drive[SPEED_COUNTS] * RAD_S_PER_COUNT
 
 
 class Drive:
@@ -170,6 +193,8 @@ class Drive:
         Targets beyond it are limited and reported as internal limit.
     deceleration_rad_s2 : float
         Slope of quick stop and fault reaction.
+    delay_periods : int
+        1 to `MAX_DELAY_PERIODS`; with 1 a command is taken at the first cycle after its arrival.
 
     Attributes
     ----------
@@ -177,11 +202,16 @@ class Drive:
         What `drive_step` works on.
     """
 
-    def __init__(self, max_speed_rpm: float = 3000.0, deceleration_rad_s2: float = 4000.0) -> None:
+    def __init__(
+        self, max_speed_rpm: float = 3000.0, deceleration_rad_s2: float = 4000.0, delay_periods: int = 1
+    ) -> None:
+        if not 1 <= delay_periods <= MAX_DELAY_PERIODS:
+            raise ValueError(f"delay_periods is {delay_periods}, must be from 1 to {MAX_DELAY_PERIODS}")
         self.words = np.zeros(DRIVE_SIZE, np.int64)
         self.words[STATE] = State.NOT_READY_TO_SWITCH_ON
         self.words[MAX_COUNTS] = int(max_speed_rpm * COUNTS_PER_RPM)
-        self.words[RAMP_COUNTS] = max(1, int(deceleration_rad_s2 * PERIOD_S / _RAD_S_PER_COUNT))
+        self.words[RAMP_COUNTS] = max(1, int(deceleration_rad_s2 * PERIOD_S / RAD_S_PER_COUNT))
+        self.words[WAIT] = delay_periods - 1
 
     @property
     def state(self) -> State:

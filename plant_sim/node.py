@@ -49,6 +49,8 @@ class Plant:
         The machine.
     sensor : PositionSensor, optional
         Default: 1 µm, no noise.
+    delay_periods : int
+        Drive cycles from the sample on whose account a command was sent to the drive taking it, 1 to 3.
 
     Attributes
     ----------
@@ -59,12 +61,17 @@ class Plant:
     name = "plant"
 
     def __init__(
-        self, contract: Contract, parameters: PlantParameters, sensor: PositionSensor | None = None
+        self,
+        contract: Contract,
+        parameters: PlantParameters,
+        sensor: PositionSensor | None = None,
+        delay_periods: int = 1,
     ) -> None:
         self._contract = contract
         self._parameters = parameters
         self._vector = parameters.vector()
         self._sensor = sensor or PositionSensor()
+        self._delay_periods = delay_periods
         self.accepts = frozenset(
             message.can_id
             for message in (contract.drive_command, contract.bench_control, contract.bench_load)
@@ -133,7 +140,10 @@ class Plant:
 
     def _restart(self, position_m: float) -> None:
         self._state = initial_state(self._parameters, position_m)
-        self._drive = Drive(self._parameters.motor_speed_rpm, self._parameters.motor_acceleration_rad_s2)
+        parameters = self._parameters
+        self._drive = Drive(
+            parameters.motor_speed_rpm, parameters.motor_acceleration_rad_s2, self._delay_periods
+        )
         self._row = np.zeros(len(COLUMNS))
         self._row[TIME] = self._time_ns
         self._run_period = partial(

@@ -9,14 +9,12 @@ import numpy as np
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS, Node
 from firmware_py.node import PHASE_NS, Controller
-from firmware_py.tuning import Tuning
 from hil.bus import link
 from hil.bus.wire import Clock, Port, Wire
 from hil.run.options import INTERRUPTED, Recording, RigOptions, RunOptions, check_bit_rate
 from hil.run.rig import Rig, play
 from hil.supervisor import Supervisor
 from plant_sim.node import Plant
-from plant_sim.parameters import PlantParameters
 
 SERVICE_NS = 10 * PERIOD_NS
 """Virtual time between looks at stop requests and listeners."""
@@ -46,8 +44,9 @@ class InprocessRig(Rig):
         """Have nothing to start."""
 
     def _begin(self, supervisor: Supervisor, bit_rate: int) -> "VirtualSession":
-        plant = Plant(self.contract, PlantParameters())
-        firmware = Controller(self.contract, Tuning().calibration().to_bytes())
+        machine, tuning = self.options.machine, self.options.tuning
+        plant = Plant(self.contract, machine.parameters, machine.sensor(), machine.delay_periods)
+        firmware = Controller(self.contract, tuning.calibration.to_bytes())
 
         def records() -> Records:
             return {node.name: node.record.columns_by_name() for node in (plant, firmware)}

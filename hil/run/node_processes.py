@@ -26,9 +26,14 @@ _END_TIMEOUT_S = 5.0
 _LAST_MOMENTS_S = 1.0
 
 
-def side_arguments(options: RigOptions, bus: BusSettings) -> list[str]:
-    """Return the command line of either side."""
-    arguments = ["-i", bus.interface, "-c", bus.channel, "--rt-ratio", str(options.rt_ratio)]
+def side_arguments(name: str, options: RigOptions, bus: BusSettings) -> list[str]:
+    """Return the command line of a side; the firmware's calibration is a file in the record directory."""
+    arguments = ["--machine", options.machine.text]
+    if name == "controller":
+        block = options.record_directory / "calibration.bin"
+        block.write_bytes(options.tuning.calibration.to_bytes())
+        arguments = ["--calibration", str(block)]
+    arguments += ["-i", bus.interface, "-c", bus.channel, "--rt-ratio", str(options.rt_ratio)]
     arguments += ["--record", str(options.record_directory), "--parent", str(os.getpid())]
     if bus.bit_rate is not None:
         arguments += ["-b", str(bus.bit_rate)]
@@ -85,7 +90,9 @@ class NodeProcesses:
     def __init__(self, options: RigOptions, bus: BusSettings) -> None:
         self._logs = {name: options.record_directory / f"{name}.stderr" for name in sorted(options.started)}
         self._processes = {
-            name: _FORK.Process(target=_be_side, args=(name, side_arguments(options, bus), log), daemon=True)
+            name: _FORK.Process(
+                target=_be_side, args=(name, side_arguments(name, options, bus), log), daemon=True
+            )
             for name, log in self._logs.items()
         }
         for process in self._processes.values():

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware_py.chosen_tuning import ChosenTuning, chosen_tuning
 from hil.run.stopping import StopFlag
-from hil.scenario import Scenario
+from hil.scenario import Scenario, controller_of
+from plant_sim.machine import Machine
 
 DEFAULT_BIT_RATE = 1_000_000
 INTERRUPTED = "interrupted"
@@ -49,6 +51,10 @@ class RigOptions:
     ----------
     record_directory : Path
         Private directory for what processes leave.
+    machine : Machine
+        What the plant is.
+    tuning : ChosenTuning
+        What the firmware is calibrated with.
     bit_rate : int or None
         Bit/s; None is `DEFAULT_BIT_RATE` on a simulated wire, and on an adapter what python-can's
         configuration or the adapter itself says.
@@ -67,6 +73,8 @@ class RigOptions:
     """
 
     record_directory: Path
+    machine: Machine = field(default_factory=Machine)
+    tuning: ChosenTuning = field(default_factory=chosen_tuning)
     bit_rate: int | None = None
     dbc: Path | None = None
     interface: str | None = None
@@ -95,14 +103,22 @@ class RunOptions(RigOptions):
     scenario : Scenario
         What is played.
     controller : str
-        Control law, one of `hil.scenario.CONTROLLERS`.
+        Control law, one of `hil.scenario.CONTROLLERS`; by default the tuning's own.
+    machine : Machine
+        The scenario's.
     progress : callable
         Told the simulated time, s.
     """
 
     scenario: Scenario
-    controller: str
+    controller: str = ""
     progress: Callable[[float], None] = lambda simulated_s: None
+    machine: Machine = field(init=False)
+
+    def __post_init__(self) -> None:
+        RigOptions.__post_init__(self)
+        object.__setattr__(self, "machine", self.scenario.machine)
+        object.__setattr__(self, "controller", self.controller or controller_of(self.tuning.calibration.law))
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,7 +87,7 @@ class Rig(ABC):
         self._stack.close()
 
     def begin(self, controller: str, position_m: float, bit_rate: int | None = None) -> Session:
-        """Reset all nodes and begin a run with the machine at rest at `position_m`.
+        """Reset all nodes and begin a run under a control law, with the machine at rest at `position_m`.
 
         Raises
         ------

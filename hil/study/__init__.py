@@ -1,1 +1,1 @@
-"""Studies of the closed loop: boxes of machines, linear analysis, tuning, the paper's evaluation."""
+"""What studies the closed loop rather than being the bench: parameter boxes, sweeps, tuning, reports."""

@@ -14,7 +14,7 @@ from hil.bus.wire_core import INTERMISSION_BITS, LOG_HEAD, LOG_TIME, arbitration
 from hil.bus.wire_time import classic_bits, worst_case_bits
 from hil.cli import main
 from hil.study.response_time import Traffic, load, response_times
-from hil.study.rta import cyclic_traffic
+from hil.study.rta_command import cyclic_traffic
 
 BIT_RATE = 125_000
 BIT_NS = 8000
