@@ -68,7 +68,10 @@ def test_nominal(bench):
     assert bench.result("")["machine"]["mass"] == 1.0
 
 def test_one_after_another(bench_at):
-    benches = [bench_at(position_m=0.2, machine=machine) for machine in ({}, HEAVY)]
+    benches = []
+    for machine in ({}, HEAVY):
+        benches.append(bench_at(position_m=0.2, machine=machine))
+        benches[-1].run(0.05)
     nominal, heavy = [bench.position_mm.last for bench in benches]
     assert nominal != heavy
 
