@@ -224,17 +224,17 @@ class Bench:
     def controller_state(self) -> ControllerState | None:
         """State of the controller: now, or in real time as last reported (every 100 ms)."""
         value = self._newest("controller_state", "ControllerStatus.State")
-        return None if np.isnan(value) else ControllerState(int(value))
+        return None if value is None else ControllerState(value)
 
     @property
     def controller_faults(self) -> set[str]:
         """Names of the controller's fault signals that are set; as up to date as `controller_state`."""
         if "controller_faults" in self.trace:
             bits = self._newest("controller_faults", "")
-            return {signal_name(str(fault.name)) for fault in Fault(0 if np.isnan(bits) else int(bits))}
+            return {signal_name(str(fault.name)) for fault in Fault(bits or 0)}
         signals = self._contract.message("ControllerStatus").signals
         flags = [name for name, signal in signals.items() if signal.length == 1]
-        return {name for name in flags if self.signal(f"ControllerStatus.{name}").last == 1}
+        return {name for name in flags if self._newest("", f"ControllerStatus.{name}") == 1}
 
     def signal(self, name: str) -> Series:
         """Return ``Message.Signal`` from the bus, in its unit, over the time since time 0."""
@@ -287,10 +287,10 @@ class Bench:
     def _column(self, name: str, factor: float) -> Series:
         return Series(self.trace["time_s"], self.trace[name] * factor)
 
-    def _newest(self, column: str, signal: str) -> float:
-        if column in self.trace:
-            return Series(self.trace["time_s"], self.trace[column]).last
-        return self.signal(signal).last
+    def _newest(self, column: str, signal: str) -> int | None:
+        """Return the newest known value of a trace column, or where there is none of a signal."""
+        series = self._column(column, 1.0) if column in self.trace else self.signal(signal)
+        return int(series.last) if series.known.size else None
 
     def _spoil(self, message: str, fault: FrameFault, argument: int, count: int) -> None:
         if count < 1:

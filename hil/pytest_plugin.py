@@ -18,6 +18,7 @@ applicable, and counted as such.
 import argparse
 import os
 import shlex
+import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping
 from fractions import Fraction
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from plant_sim.machine import Machine
 
 MODES = ("inprocess", "lockstep", "realtime")
+BEGINNINGS = ("controller", "position_m", "bit_rate", "machine", "tuning")
 STARTS = {"both": ("plant", "controller"), "none": (), "plant": ("plant",), "controller": ("controller",)}
 
 _VIRTUAL = frozenset({"virtual_time", "wire_faults", "power"})
@@ -82,7 +84,8 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "needs(*what): not applicable where the interface lacks it")
     if config.getoption("hil_interface") and config.getoption("hil_mode") != "realtime":
         raise pytest.UsageError("--hil-interface needs --hil-mode realtime")
-    _ratio(config)
+    if _ratio(config) != 1 and config.getoption("hil_mode") != "realtime":
+        raise pytest.UsageError("--rt-ratio needs --hil-mode realtime: virtual time has no pace")
 
 
 def interface_of(config: pytest.Config) -> str:
@@ -104,7 +107,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if begins := item.get_closest_marker("bench"):
             needs += [need for need in OF_SIDES.values() if need in begins.kwargs]
         if unknown := [need for need in needs if need not in known]:
-            raise pytest.UsageError(f"{item.nodeid}: nothing has {unknown[0]!r}")
+            choice = ", ".join(sorted(known))
+            raise pytest.UsageError(f"{item.nodeid}: nothing has {unknown[0]!r}: choose from {choice}")
         if missing := [need for need in needs if need not in has]:
             lacking[missing[0]] += 1
             out.append(item)
@@ -218,7 +222,10 @@ def bench_at(hil_rig: "Callable[..., Rig]", _benches: "list[Bench]") -> "Iterato
 def bench(request: pytest.FixtureRequest, bench_at: "Callable[..., Bench]") -> "Bench":
     """Return a bench that is brought up and enabled; the marker `bench` says how it begins."""
     marker = request.node.get_closest_marker("bench")
-    return bench_at(**(marker.kwargs if marker else {}))
+    how = marker.kwargs if marker else {}
+    if unknown := [key for key in how if key not in BEGINNINGS]:
+        pytest.fail(f"a bench takes no {unknown[0]!r}: choose from {', '.join(BEGINNINGS)}", pytrace=False)
+    return bench_at(**how)
 
 
 def _new_rig(config: pytest.Config, directory: Path, machine: "Machine", tuning: "ChosenTuning") -> "Rig":
@@ -268,7 +275,7 @@ def _properties(result: dict[str, Any]) -> list[tuple[str, object]]:
 
 def _leave(item: pytest.Item, bench: "Bench", number: int) -> Path:
     """Write a bench's folder and return it."""
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in item.name)
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in f"{item.path.stem}.{item.name}")
     folder: Path = item.config.getoption("hil_out") / (f"{name}-{number + 1}" if number else name)
     bench.write(folder, item.name)
     return folder
@@ -283,4 +290,5 @@ def _replay_command(item: pytest.Item) -> str:
         if value is not None and any(str(argument).startswith(f"--{option}") for argument in given):
             options.append(f"--{option}={value}")
     path = os.path.relpath(item.path, item.config.invocation_params.dir)
-    return shlex.join(["pytest", "::".join([path, *item.nodeid.split("::")[1:]]), *options])
+    test = "::".join([path, *item.nodeid.split("::")[1:]])
+    return shlex.join([sys.executable, "-m", "pytest", test, *options])

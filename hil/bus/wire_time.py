@@ -98,6 +98,20 @@ def classic_bits(can_id: int, dlc: int, data: int) -> int:
     return header_bits + data_bits + 15 + stuff_bits + UNSTUFFED_BITS
 
 
+def worst_case_bits(can_id: int, dlc: int) -> int:
+    """Return the length in bits of a classic data frame that needs as many stuff bits as there can be.
+
+    Parameters
+    ----------
+    can_id : int
+        Identifier; `EFF_FLAG` set for a 29-bit one.
+    dlc : int
+        Number of data bytes, 0..8.
+    """
+    stuffed = (54 if can_id & EFF_FLAG else 34) + 8 * dlc
+    return stuffed + (stuffed - 1) // 4 + UNSTUFFED_BITS
+
+
 def traffic_bits(traffic: NDArray[Any]) -> NDArray[np.int64]:
     """Return the length of each frame of a log in bits; its rows are time, id, dlc, data."""
     return np.array([classic_bits(*frame) for _, *frame in traffic.tolist()], np.int64)

@@ -90,6 +90,22 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
+class Stability:
+    """Linear loops about one operating point, by label.
+
+    Attributes
+    ----------
+    maps : mapping of StabilityMap
+        Over the stroke, with the machines of the heat map.
+    corners : mapping of mapping
+        `StabilityMap.summary` for all corners of the box.
+    """
+
+    maps: Mapping[str, StabilityMap]
+    corners: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
 class Evaluation:
     """All that was computed.
 
@@ -103,8 +119,8 @@ class Evaluation:
         By scenario and label.
     swept : mapping of mapping
         By label, from `hil.study.sweep.Sweep.summary`.
-    maps : mapping of StabilityMap
-        By label.
+    stability : mapping of Stability
+        By operating point.
     validation : Validation
         Figure 3b.
     """
@@ -113,7 +129,7 @@ class Evaluation:
     scenarios: Sequence[str]
     runs: Mapping[tuple[str, str], Run]
     swept: Mapping[str, Mapping[str, Any]]
-    maps: Mapping[str, StabilityMap]
+    stability: Mapping[str, Stability]
     validation: Validation
 
     def traces(self, scenario: str) -> dict[str, Trace]:
@@ -176,10 +192,14 @@ def sweep_of(contestant: Contestant) -> Sweep:
     )
 
 
-def stability_of(taking_part: Sequence[Contestant]) -> dict[str, StabilityMap]:
-    """Return the linear loops of all contestants over stroke and machines."""
+def stability_of(taking_part: Sequence[Contestant], point: str) -> Stability:
+    """Return the linear loops of all contestants about one of `hil.study.linear.OPERATING_POINTS`."""
     tunings = {one.label: (TUNINGS[one.tuning], one.law_number) for one in taking_part}
-    return stability_maps(tunings, map_machines())
+    corners = stability_maps(tunings, load_box().corners(), point=point)
+    return Stability(
+        maps=stability_maps(tunings, map_machines(), point=point),
+        corners={label: one.summary() for label, one in corners.items()},
+    )
 
 
 def tables_of(evaluation: Evaluation) -> dict[str, Any]:
@@ -224,7 +244,13 @@ def tables_of(evaluation: Evaluation) -> dict[str, Any]:
                 for label, summary in evaluation.swept.items()
             },
         },
-        "stability": {label: one.summary() for label, one in evaluation.maps.items()},
+        "stability": {
+            point: {
+                label: {"nominal_and_corners": one.summary(), "box": stability.corners[label]}
+                for label, one in stability.maps.items()
+            }
+            for point, stability in evaluation.stability.items()
+        },
         "state_space": evaluation.validation.figures(),
     }
     return dict(_shortened(tables))

@@ -71,18 +71,22 @@ def evaluate(
         The files.
     """
     from hil.study.evaluation import Evaluation, play, stability_of, tables_of
+    from hil.study.linear import OPERATING_POINTS
     from hil.study.report_page import page
     from hil.study.state_space import validate
 
     pairs = [(name, one) for name in scenarios for one in taking_part]
-    tasks: list[Callable[[], Any]] = [validate, *(partial(play, pair) for pair in pairs)]
-    validation, *played = _all(cores, tasks, stopped, progress, "playing")
+    runs = _all(cores, [partial(play, pair) for pair in pairs], stopped, progress, "playing")
+    analyses: list[Callable[[], Any]] = [
+        partial(stability_of, taking_part, point) for point in OPERATING_POINTS
+    ]
+    validation, *stability = _all(cores, [validate, *analyses], stopped, progress, "analysing")
     evaluation = Evaluation(
         taking_part=taking_part,
         scenarios=scenarios,
-        runs={(name, one.label): run for (name, one), run in zip(pairs, played, strict=True)},
+        runs={(name, one.label): run for (name, one), run in zip(pairs, runs, strict=True)},
         swept=_swept(taking_part, cores, stopped, progress),
-        maps=stability_of(taking_part),
+        stability=dict(zip(OPERATING_POINTS, stability, strict=True)),
         validation=validation,
     )
     tables = tables_of(evaluation)
@@ -131,7 +135,10 @@ def _drawings(
     traces = {name: evaluation.traces(name) for name in evaluation.scenarios}
     papers = [one.label for one in evaluation.taking_part if one.in_paper]
     pictures: list[tuple[str, Callable[..., figures.Draw], tuple[Any, ...]]] = [
-        ("stability", heat_map, (evaluation.maps,)),
+        *(
+            (f"stability_{point}", heat_map, (evaluation.stability[point].maps,))
+            for point in figures.MAPPED_POINTS
+        ),
         *(
             (
                 f"figure_{paper.CASES[name].figure}",
@@ -195,7 +202,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 
 
 def _of_an_earlier_run(out: Path) -> Iterable[Path]:
-    names = "figure_*", "rivals", "comparison", "stability"
+    names = "figure_*", "rivals", "comparison", "stability*"
     return [path for name in names for suffix in (".svg", ".png") for path in out.glob(name + suffix)]
 
 

@@ -250,6 +250,11 @@ def test_an_interface_in_virtual_time(capsys, out):
     assert "--interface needs --mode realtime" in line
 
 
+def test_a_pace_in_virtual_time(capsys, out):
+    line = refused(capsys, "run", "sine", "--rt-ratio", "0.1", "--out", out)
+    assert "--rt-ratio needs --mode realtime" in line
+
+
 def test_an_interface_without_a_channel(capsys, out):
     line = refused(capsys, "run", "sine", "--mode", "realtime", "-i", "socketcan", "--out", out)
     assert "no channel for socketcan: give -i and -c" in line

@@ -68,7 +68,10 @@ def test_nominal(bench):
     assert bench.result("")["machine"]["mass"] == 1.0
 
 def test_one_after_another(bench_at):
-    benches = [bench_at(position_m=0.2, machine=machine) for machine in ({}, HEAVY)]
+    benches = []
+    for machine in ({}, HEAVY):
+        benches.append(bench_at(position_m=0.2, machine=machine))
+        benches[-1].run(0.05)
     nominal, heavy = [bench.position_mm.last for bench in benches]
     assert nominal != heavy
 
@@ -164,26 +167,26 @@ def test_the_session_ends_as_its_tests_did(session):
 
 
 def test_a_failing_test_leaves_its_folder_and_says_where(session):
-    folder = session.folder / "out/pytest/test_fails"
+    folder = session.folder / "out/pytest/test_user.test_fails"
     assert {file.name for file in folder.iterdir()} == {
         "result.json",
         "trace.csv",
         "bus.log",
         "picture.png",
     }
-    assert "results in out/pytest/test_fails" in session.lines
-    assert [entry.name for entry in folder.parent.iterdir()] == ["test_fails"]
+    assert "results in out/pytest/test_user.test_fails" in session.lines
+    assert [entry.name for entry in folder.parent.iterdir()] == ["test_user.test_fails"]
 
 
 def test_the_replay_command_replays_the_run_to_the_last_bit(session, tmp_path):
     command = next(line for line in session.lines if line.startswith("replay: "))
-    program, *arguments = shlex.split(command.removeprefix("replay: "))
-    assert program == "pytest"
-    result = session.folder / "out/pytest/test_fails/result.json"
+    program, module, pytest_, *arguments = shlex.split(command.removeprefix("replay: "))
+    assert (program, module, pytest_) == (sys.executable, "-m", "pytest")
+    result = session.folder / "out/pytest/test_user.test_fails/result.json"
     again = run_pytest(session.folder, *arguments, f"--hil-out={tmp_path}")
     assert again.code == 1
     sha256 = json.loads(result.read_text())["bus_sha256"]
-    assert json.loads((tmp_path / "test_fails/result.json").read_text())["bus_sha256"] == sha256
+    assert json.loads((tmp_path / "test_user.test_fails/result.json").read_text())["bus_sha256"] == sha256
 
 
 def test_the_replay_command_holds_where_pytest_was_started(session, tmp_path):
@@ -194,14 +197,13 @@ def test_the_replay_command_holds_where_pytest_was_started(session, tmp_path):
         f"{session.folder.name}/test_user.py::test_fails",
         cwd=session.folder.parent,
     )
-    assert (
-        f"replay: pytest {session.folder.name}/test_user.py::test_fails --hil-mode=inprocess" in again.lines
-    )
+    test = f"{session.folder.name}/test_user.py::test_fails"
+    assert f"replay: {sys.executable} -m pytest {test} --hil-mode=inprocess" in again.lines
 
 
 def test_figures_go_into_the_junit_file(session):
     figures = dict(session.properties()["test_user.test_fails"])
-    result = json.loads((session.folder / "out/pytest/test_fails/result.json").read_text())
+    result = json.loads((session.folder / "out/pytest/test_user.test_fails/result.json").read_text())
     assert figures["bench"] == "inprocess"
     assert float(figures["rms_mm"]) == result["rms_mm"]
     assert float(figures["latency_us_p99"]) == result["timing"]["latency_us"]["p99"]
@@ -225,6 +227,7 @@ def test_only_what_was_selected_is_counted(tmp_path):
     ("arguments", "said"),
     [
         (["--hil-interface=hilbus"], "--hil-interface needs --hil-mode realtime"),
+        (["--rt-ratio=0.1"], "--rt-ratio needs --hil-mode realtime"),
         (["--hil-mode=realtime", "--rt-ratio=0"], "--rt-ratio: "),
         (["--hil-mode=realtime", "--rt-ratio=fast"], "--rt-ratio: "),
         (["--hil-mode=fast"], "argument --hil-mode: invalid choice: 'fast'"),
@@ -240,7 +243,15 @@ def test_a_wrong_option_is_refused_with_one_line(tmp_path, arguments, said):
 def test_a_need_that_nothing_has_is_refused(tmp_path):
     refused = user_session(tmp_path, USER_TESTS.replace("wire_faults", "wirefaults"), "--hil-mode=inprocess")
     assert refused.code == 4
-    assert "ERROR: test_user.py::test_spoils_the_wire: nothing has 'wirefaults'" in refused.lines
+    choose = "choose from machine, power, real_bus, tuning, virtual_time, wall_time, wire_faults"
+    assert f"ERROR: test_user.py::test_spoils_the_wire: nothing has 'wirefaults': {choose}" in refused.lines
+
+
+def test_a_beginning_that_a_bench_does_not_have_is_named(tmp_path):
+    mistyped = USER_TESTS.replace('controller="pi"', 'control="pi"')
+    session = user_session(tmp_path, mistyped, "--hil-mode=inprocess", "-k", "begins_as_marked")
+    assert "a bench takes no 'control': choose from controller, position_m, bit_rate" in session.said
+    assert "TypeError" not in session.said
 
 
 @pytest.mark.parametrize("mode", ["inprocess", "lockstep"])

@@ -26,13 +26,19 @@ from hil import cli
 from hil.run.stopping import StopFlag
 from hil.study import evaluation, paper
 from hil.study.evaluation import METRICS, OBSERVED, TRUE, Contestant, Evaluation, Run, contestants, tables_of
+from hil.study.linear import OPERATING_POINTS
 from hil.study.report_page import page
 from hil.study.reproduce import evaluate, summary
 from hil.study.runs import all_cores
 from hil.study.state_space import Validation
 
 ROOT = Path(__file__).parents[2]
-PICTURES = {"figure_3b", "figure_5", "figure_6", "figure_7", "figure_8", "rivals", "comparison", "stability"}
+PICTURES = {f"figure_{number}" for number in ("3b", 5, 6, 7, 8)} | {
+    "comparison",
+    "rivals",
+    "stability_held",
+    "stability_shut",
+}
 
 
 @pytest.fixture(scope="module")
@@ -165,11 +171,13 @@ def test_who_is_best_is_best_whoever_it_is():
     assert tables["best_counts"] == {"P": 2, "PI": 2, "ADRC": 2, "rival": 3}
 
 
-def test_stability_is_judged_for_everyone_from_end_to_end(tables):
-    assert list(tables["stability"]) == list(tables["contestants"])
-    for one in tables["stability"].values():
-        assert one["machines"] == 27
-        assert (one["unstable_machines"] > 0) == (one["largest_spectral_radius"] >= 1.0)
+@pytest.mark.parametrize("point", OPERATING_POINTS)
+def test_stability_is_judged_for_everyone_about_every_point(tables, point):
+    assert list(tables["stability"][point]) == list(tables["contestants"])
+    for one in tables["stability"][point].values():
+        assert [verdict["machines"] for verdict in one.values()] == [27, 256]
+        for verdict in one.values():
+            assert (verdict["unstable_machines"] > 0) == (verdict["largest_spectral_radius"] >= 1.0)
 
 
 # the report
@@ -226,7 +234,7 @@ def test_one_worker_alone_gives_the_same_figures_and_pictures_to_the_last_bit(
     for name in ("figure_5.svg", "figure_5.png"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
     for one in three:
-        for part in (("scenarios", "sine", "ours"), ("stability",)):
+        for part in (("scenarios", "sine", "ours"), ("stability", "held")):
             here, there = (reduce(dict.__getitem__, part, whole)[one.label] for whole in (alone, tables))
             assert json.dumps(here) == json.dumps(there)
 
