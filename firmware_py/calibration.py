@@ -40,6 +40,22 @@ GAINS = (
     k.CAL_FB_A1,
     k.CAL_FB_A2,
     k.CAL_FB_Z4,
+    k.CAL_FRONT_SMOOTH,
+    k.CAL_FRONT_LEAD,
+    k.CAL_FRONT_EXTEND,
+    k.CAL_FRONT_RETRACT,
+    k.CAL_COMMAND_SMOOTH,
+    k.CAL_SCHEDULED_BETA1,
+    k.CAL_SCHEDULED_BETA2,
+    k.CAL_SCHEDULED_BETA3,
+    k.CAL_SCHEDULED_BETA4,
+    k.CAL_SCHEDULED_BETA4_SOFT,
+    k.CAL_SCHEDULED_B0,
+    k.CAL_SCHEDULED_MOTOR,
+    k.CAL_SCHEDULED_K1,
+    k.CAL_SCHEDULED_K2,
+    k.CAL_SCHEDULED_K3,
+    k.CAL_SCHEDULED_K3_SOFT,
 )
 """Indices of the mantissas; the shift follows each."""
 
@@ -54,6 +70,12 @@ VALUE_RANGES = {
     k.CAL_FB_DELTA1: (1, INT32_MAX),
     k.CAL_FB_DELTA2: (1, INT32_MAX),
     k.CAL_FB_DELTA3: (1, INT32_MAX),
+    k.CAL_COMMAND_SLEW: (1, INT32_MAX),
+    k.CAL_STROKE: (1, INT32_MAX),
+    k.CAL_STIFFNESS_END_A: (1, INT32_MAX),
+    k.CAL_STIFFNESS_END_B: (1, INT32_MAX),
+    k.CAL_STIFFNESS_A: (1, INT32_MAX),
+    k.CAL_STIFFNESS_B: (1, INT32_MAX),
 }
 """Legal values of the words that are no gains; within them no 64-bit intermediate overflows."""
 
@@ -87,7 +109,7 @@ class Calibration:
     words: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        if self.law not in (k.LAW_P, k.LAW_PI, k.LAW_ADRC):
+        if not k.LAW_P <= self.law <= k.LAW_SCHEDULED:
             raise CalibrationError(f"calibration: unknown control law {self.law}")
         if len(self.words) != k.CAL_SIZE:
             raise CalibrationError(f"calibration: {len(self.words)} words instead of {k.CAL_SIZE}")

@@ -55,6 +55,88 @@ class AdrcTuning:
 
 
 @dataclass(frozen=True, slots=True)
+class FrontEndTuning:
+    """Velocity feed-forward on the limited setpoint.
+
+    Attributes
+    ----------
+    extend_rad_per_m, retract_rad_per_m : float
+        Motor speed per rod speed. Lossless, it is A_A / D_A = 1363 rad/m (Table 2); the pumps' loss makes it
+        A_A / (eta D_A) = 1604 to extend and A_A / ((2 - eta) D_A) = 1186 to retract under a load that pushes
+        the rod in. What lies between serves loads of both directions.
+    lead_s : float
+        Time by which the setpoint's speed is led, for what filter, bus and motor take: s.
+    lead_filter_s : float
+        Time constant of the low-pass behind which its acceleration is taken, s.
+    """
+
+    extend_rad_per_m: float = 1363.0
+    retract_rad_per_m: float = 1363.0
+    lead_s: float = 0.0
+    lead_filter_s: float = 5e-3
+
+
+@dataclass(frozen=True, slots=True)
+class CommandFilterTuning:
+    """Low-pass and slew limit on the way to the drive; a time constant of 0 makes no low-pass."""
+
+    time_constant_s: float = 0.0
+    slew_rad_s2: float = 2000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduledTuning:
+    """ADRC whose nominal model is scheduled on the position; every figure is chosen, none is the paper's.
+
+    The oil's stiffness over that at the reference position is
+    S(x) = (1 / (x + end_a) + ratio / (L - x + end_b)) / (the same at the reference): eqs 20 to 22 with the
+    areas' ratio 0.75, and with ends that are softer than the machine's (0.7 and 0.9 mm).
+    b0(x) = b0 S(x) and a1n(x) = -kappa b0(x) with the front end's kappa.
+
+    Attributes
+    ----------
+    b0_m_s2_per_rad : float
+        Input gain at the reference position.
+    omega_o_rad_s, omega_d_rad_s : float
+        Bandwidth of the observer for the motion, and for the disturbance:
+        beta04 = omega_d omega_o (omega_o^2 + \\|a1n(x)\\|), which puts the slowest pole near omega_d / 4.
+    k1_rad_s_per_m, k2_rad_per_m : float
+        Motor speed per error of position and of velocity.
+    k3_rad_s_per_m, k3_soft_rad_s_per_m : float
+        Motor speed taken back per acceleration z3 (per m/s²: rad s/m), constant and in proportion to 1 / S.
+    motor_time_constant_s : float
+        Of the motor in the observer's model.
+    """
+
+    b0_m_s2_per_rad: float = 4.44
+    omega_o_rad_s: float = 89.0
+    omega_d_rad_s: float = 31.0
+    k1_rad_s_per_m: float = 10_965.0
+    k2_rad_per_m: float = -229.5
+    k3_rad_s_per_m: float = 0.0
+    k3_soft_rad_s_per_m: float = 1.72
+    motor_time_constant_s: float = 1.55e-3
+    stroke_m: float = 0.4
+    end_a_m: float = 0.035
+    end_b_m: float = 0.030
+    area_ratio: float = 0.75
+    reference_m: float = 0.15
+
+    def stiffness(self, position_m: float) -> float:
+        """Return S(x)."""
+        return self._columns(min(max(position_m, 0.0), self.stroke_m)) / self._columns(self.reference_m)
+
+    @property
+    def reference_columns_m(self) -> float:
+        """Length of one column of A as stiff as both are at the reference."""
+        return 1 / self._columns(self.reference_m)
+
+    def _columns(self, position_m: float) -> float:
+        column_b_m = self.stroke_m - position_m + self.end_b_m
+        return 1 / (position_m + self.end_a_m) + self.area_ratio / column_b_m
+
+
+@dataclass(frozen=True, slots=True)
 class LimiterTuning:
     """Velocity and acceleration a setpoint may ask for."""
 
@@ -66,6 +148,15 @@ P = PiTuning(31_100.0)
 PI = PiTuning(27_270.0, 39_900.0)
 PI_STAR = PiTuning(20_853.0, 513_300.0)
 ADRC = AdrcTuning()
+LINEAR = AdrcTuning(  # bandwidths optimised under Ms <= 2, see hil.study.rivals
+    omega_o_rad_s=201.0,
+    omega_c_rad_s=215.0,
+    eso_delta_m=0.99,
+    delta1_m=0.99,
+    delta2_m_s=7.8,
+    delta3_m_s2=1950.0,
+)
+"""ADRC in a linear zone so wide that it never leaves it."""
 
 
 def _gain(index: int, factor: float) -> dict[int, int]:
@@ -110,6 +201,9 @@ class Tuning:
     p: PiTuning = P
     pi: PiTuning = PI
     adrc: AdrcTuning = field(default_factory=AdrcTuning)
+    scheduled: ScheduledTuning = field(default_factory=ScheduledTuning)
+    front_end: FrontEndTuning = field(default_factory=FrontEndTuning)
+    command_filter: CommandFilterTuning = field(default_factory=CommandFilterTuning)
     limiter: LimiterTuning = field(default_factory=LimiterTuning)
     speed_limit_rpm: float = 3000.0
 
@@ -125,6 +219,9 @@ class Tuning:
             raise TuningError("tuning: the P law has no integral gain")
         words = self._limits() | self._pi() | _differentiator(self.adrc) | _observer(self.adrc)
         words |= _feedback(self.adrc)
+        words |= _front_end(self.front_end) | _command_filter(self.command_filter)
+        words |= _schedule(self.scheduled) | _scheduled_observer(self.scheduled, self.front_end)
+        words |= _scheduled_feedback(self.scheduled)
         return Calibration(self.law, tuple(words[index] for index in range(k.CAL_SIZE)))
 
     def _limits(self) -> dict[int, int]:
@@ -196,5 +293,70 @@ def _feedback(adrc: AdrcTuning) -> dict[int, int]:
     )
 
 
-TUNINGS = {"paper": Tuning(), "pi_star": Tuning(law=k.LAW_PI, pi=PI_STAR)}
+def _share(time_constant_s: float) -> float:
+    """Return the share of a step that a first-order lag passes in a period."""
+    return -math.expm1(-PERIOD_S / time_constant_s) if time_constant_s > 0 else 1.0
+
+
+def _front_end(front_end: FrontEndTuning) -> dict[int, int]:
+    lsb = SPEED_LSB / PERIOD_S / U_LSB
+    smooth = _share(front_end.lead_filter_s)
+    return (
+        _gain(k.CAL_FRONT_SMOOTH, smooth * SPEED_LSB / ACCELERATION_LSB)
+        | _gain(k.CAL_FRONT_LEAD, front_end.lead_s / PERIOD_S * ACCELERATION_LSB / SPEED_LSB)
+        | _gain(k.CAL_FRONT_EXTEND, front_end.extend_rad_per_m * lsb)
+        | _gain(k.CAL_FRONT_RETRACT, front_end.retract_rad_per_m * lsb)
+    )
+
+
+def _command_filter(command_filter: CommandFilterTuning) -> dict[int, int]:
+    return _gain(k.CAL_COMMAND_SMOOTH, _share(command_filter.time_constant_s)) | _value(
+        k.CAL_COMMAND_SLEW, command_filter.slew_rad_s2 * PERIOD_S, U_LSB
+    )
+
+
+def _schedule(scheduled: ScheduledTuning) -> dict[int, int]:
+    share_m = scheduled.reference_columns_m
+    return (
+        _value(k.CAL_STROKE, scheduled.stroke_m, POSITION_LSB)
+        | _value(k.CAL_STIFFNESS_END_A, scheduled.end_a_m, POSITION_LSB)
+        | _value(k.CAL_STIFFNESS_END_B, scheduled.end_b_m, POSITION_LSB)
+        | _value(k.CAL_STIFFNESS_A, share_m, POSITION_LSB)
+        | _value(k.CAL_STIFFNESS_B, scheduled.area_ratio * share_m, POSITION_LSB)
+    )
+
+
+def _scheduled_observer(scheduled: ScheduledTuning, front_end: FrontEndTuning) -> dict[int, int]:
+    if not scheduled.b0_m_s2_per_rad > 0:
+        raise TuningError(f"tuning: b0 = {scheduled.b0_m_s2_per_rad} must be positive")
+    w = scheduled.omega_o_rad_s * PERIOD_S
+    kappa = (front_end.extend_rad_per_m + front_end.retract_rad_per_m) / 2
+    disturbance = scheduled.omega_d_rad_s * PERIOD_S * scheduled.omega_o_rad_s * POSITION_LSB / U_LSB
+    soft = scheduled.omega_o_rad_s**2 / scheduled.b0_m_s2_per_rad
+    return (
+        _gain(k.CAL_SCHEDULED_BETA1, 4 * w)
+        | _gain(k.CAL_SCHEDULED_BETA2, 6 * w**2 * POSITION_LSB / SPEED_LSB)
+        | _gain(k.CAL_SCHEDULED_BETA3, 4 * w**3 * POSITION_LSB / ACCELERATION_LSB)
+        | _gain(k.CAL_SCHEDULED_BETA4, disturbance * kappa)
+        | _gain(k.CAL_SCHEDULED_BETA4_SOFT, disturbance * soft)
+        | _gain(k.CAL_SCHEDULED_B0, scheduled.b0_m_s2_per_rad * PERIOD_S**3 * U_LSB / ACCELERATION_LSB)
+        | _gain(k.CAL_SCHEDULED_MOTOR, _share(scheduled.motor_time_constant_s))
+    )
+
+
+def _scheduled_feedback(scheduled: ScheduledTuning) -> dict[int, int]:
+    acceleration = ACCELERATION_LSB / PERIOD_S**2 / U_LSB
+    return (
+        _gain(k.CAL_SCHEDULED_K1, scheduled.k1_rad_s_per_m * POSITION_LSB / U_LSB)
+        | _gain(k.CAL_SCHEDULED_K2, scheduled.k2_rad_per_m * SPEED_LSB / PERIOD_S / U_LSB)
+        | _gain(k.CAL_SCHEDULED_K3, scheduled.k3_rad_s_per_m * acceleration)
+        | _gain(k.CAL_SCHEDULED_K3_SOFT, scheduled.k3_soft_rad_s_per_m * acceleration)
+    )
+
+
+TUNINGS = {
+    "paper": Tuning(),
+    "pi_star": Tuning(law=k.LAW_PI, pi=PI_STAR),
+    "linear": Tuning(adrc=LINEAR),
+}
 """The built-in calibrations by name; each has the law it is named for as its default."""

@@ -10,11 +10,11 @@ from dbc.contract import Contract
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
 from hil.bus.wire import ErrorState, FrameFault, Port, Wire
-from hil.measure import M_TO_MM, Trace, figures_of, timing_in, trace_of
+from hil.measure import M_TO_MM, Trace, figures_of, setting_of, timing_in, trace_of
 from hil.report import OutputDirectory
 from hil.run.options import SIDES, BenchError, Recording
 from hil.run.rig import Rig
-from hil.scenario import MAX_LOAD_N, PERIOD_S, TimingLimits
+from hil.scenario import MAX_LOAD_N, PERIOD_S, TimingLimits, controller_of
 from hil.signals import Series, signal_of
 from hil.supervisor import BRING_UP_PERIODS, Reference
 from hil.timing import Figure, Timing
@@ -38,7 +38,7 @@ class Bench:
     rig : Rig
         Bus and nodes; its sessions come one after another.
     controller : str
-        Control law, one of `hil.scenario.CONTROLLERS`.
+        Control law, one of `hil.scenario.CONTROLLERS`; by default that of the rig's tuning.
     position_m : float
         Where the machine starts.
     bit_rate : int, optional
@@ -51,15 +51,16 @@ class Bench:
     """
 
     def __init__(
-        self, rig: Rig, controller: str = "adrc", position_m: float = 0.0, bit_rate: int | None = None
+        self, rig: Rig, controller: str = "", position_m: float = 0.0, bit_rate: int | None = None
     ) -> None:
         if not 0.0 <= position_m <= STROKE_M:
             raise ValueError(f"position_m is {position_m}, must be from 0 to {STROKE_M} m")
         self.mode = rig.mode
         self.bit_rate = bit_rate or rig.bit_rate
-        self.controller = controller
+        self.controller = controller or controller_of(rig.options.tuning.calibration.law)
+        self._setting = setting_of(rig.options)
         self._contract = rig.contract
-        self._session = rig.begin(controller, position_m, bit_rate)
+        self._session = rig.begin(self.controller, position_m, bit_rate)
         self._supervisor = self._session.supervisor
         self._period = BRING_UP_PERIODS
         self._recording: Recording | None = None
@@ -278,7 +279,7 @@ class Bench:
         figures = figures_of(
             self.recording, self.trace, self.timing, self._contract, self.bit_rate, self.mode
         )
-        return {"scenario": name, "controller": self.controller, **figures, "paper": None}
+        return {"scenario": name, "controller": self.controller, **self._setting, **figures, "paper": None}
 
     def write(self, folder: Path, name: str) -> list[Path]:
         """Leave figures, trace, bus log and picture in a folder; return the files."""
@@ -286,7 +287,8 @@ class Bench:
             return directory.write(self.result(name), self.trace, self.recording.traffic)
 
     def end(self) -> None:
-        """Leave the machine disabled; nothing runs afterwards."""
+        """Keep what there is and leave the machine disabled; nothing runs afterwards."""
+        self._recording = self.recording  # the rig forgets it when another run begins
         self._session.end()
 
     def _go_on(self) -> None:

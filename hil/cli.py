@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
@@ -40,7 +41,7 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
-from hil.study import rta_command, sweep_command
+from hil.study import reproduce, rta_command, sweep_command
 from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
@@ -76,6 +77,9 @@ def main(argv: list[str] | None = None) -> int:
     except REFUSALS as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
+    except BrokenExecutor as error:
+        print(f"hil: a worker process was lost: {error}", file=sys.stderr)
+        return EXIT_BROKEN
     return code
 
 
@@ -133,6 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
     status.set_defaults(command=_vcan_status)
 
+    reproduce.add_command(commands)
     rta_command.add_command(commands)
 
     listing = commands.add_parser("list", help="list the built-in scenarios")
@@ -227,7 +232,9 @@ def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
 
 
 def _table(result: dict[str, Any]) -> Table:
-    table = Table(title=f"{result['scenario']}, {result['controller']}, {result['mode']}")
+    table = Table(
+        title=f"{result['scenario']}, {result['controller']} ({result['tuning']}), {result['mode']}"
+    )
     table.add_column("")
     table.add_column("this run", justify="right")
     table.add_column("limit", justify="right")

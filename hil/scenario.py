@@ -14,7 +14,7 @@ from hil.references import REFERENCES
 from plant_sim.machine import Machine
 from plant_sim.parameters import ParameterError
 
-CONTROLLERS = ("p", "pi", "adrc")
+CONTROLLERS = ("p", "pi", "adrc", "pi_ff", "scheduled")
 PERIOD_S = PERIOD_NS * 1e-9
 MAX_LOAD_N = 1e6
 

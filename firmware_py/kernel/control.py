@@ -1,7 +1,9 @@
 """Entry points: `control_reset` before the first tick, `control_step` once per 1 ms tick."""
 
 from firmware_py.kernel.adrc import adrc_reset, adrc_step
+from firmware_py.kernel.command_filter import command_filter_reset, command_filter_step
 from firmware_py.kernel.fixedpoint import clamp
+from firmware_py.kernel.front_end import front_end_reset
 from firmware_py.kernel.layout import (
     CAL_U_LIMIT,
     FLAG_SETPOINT_LIMITED,
@@ -16,13 +18,16 @@ from firmware_py.kernel.layout import (
     LAW_ADRC,
     LAW_P,
     LAW_PI,
+    LAW_PI_FF,
+    LAW_SCHEDULED,
     ST_LAW,
     ST_SATURATIONS,
     ST_U,
 )
 from firmware_py.kernel.limiter import limiter_reset, limiter_step
 from firmware_py.kernel.machine import Array32, i32, i64, int32
-from firmware_py.kernel.pi import p_step, pi_reset, pi_step
+from firmware_py.kernel.pi import p_step, pi_ff_step, pi_reset, pi_step
+from firmware_py.kernel.scheduled import scheduled_reset, scheduled_step
 from firmware_py.kernel.units import (
     metres_from_position,
     metres_from_setpoint,
@@ -35,6 +40,9 @@ def law_reset(state: Array32, position: int32) -> None:
     """Start every law at rest at `position` (2^-31 m)."""
     adrc_reset(state, position)
     pi_reset(state)
+    front_end_reset(state, position)
+    scheduled_reset(state)
+    command_filter_reset(state)
 
 
 def control_reset(calibration: Array32, state: Array32, io: Array32) -> None:
@@ -55,9 +63,13 @@ def law_step(calibration: Array32, state: Array32, setpoint: int32, position: in
     if state[ST_LAW] == LAW_ADRC:
         return adrc_step(calibration, state, setpoint, position)
     if state[ST_LAW] == LAW_PI:
-        return pi_step(calibration, state, setpoint, position)
+        return pi_step(calibration, state, setpoint, position, 0)
     if state[ST_LAW] == LAW_P:
         return p_step(calibration, setpoint, position)
+    if state[ST_LAW] == LAW_SCHEDULED:
+        return command_filter_step(calibration, state, scheduled_step(calibration, state, setpoint, position))
+    if state[ST_LAW] == LAW_PI_FF:
+        return command_filter_step(calibration, state, pi_ff_step(calibration, state, setpoint, position))
     return 0
 
 

@@ -5,12 +5,14 @@ A gain takes two words: mantissa at the index, shift at the next one; it stands 
 the LSBs of its output over those of its input.
 """
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 
 # control laws
 LAW_P = 1
 LAW_PI = 2
-LAW_ADRC = 3
+LAW_ADRC = 3  # as the paper has it
+LAW_PI_FF = 4  # PI with velocity feed-forward
+LAW_SCHEDULED = 5  # ADRC with its model scheduled on the position
 
 # io
 IO_LAW = 0  # in: one of LAW_*; any other value commands standstill
@@ -31,7 +33,7 @@ ST_SATURATIONS = 1  # see IO_SATURATIONS
 ST_LIMITER_INPUT = 2  # last setpoint, 2^-31 m
 ST_LIMITER_POSITION = 3  # limited setpoint, 2^-31 m
 ST_LIMITER_RATE = 4  # its last increment, 2^-31 m per T
-ST_V1 = 5  # tracking differentiator: position, 2^-31 m
+ST_V1 = 5  # tracking differentiator or front end: position, 2^-31 m
 ST_V2 = 6  # v2 T, 2^-38 m
 ST_V3 = 7  # v3 T^2, 2^-40 m
 ST_Z1 = 8  # observer: position, 2^-31 m
@@ -40,7 +42,11 @@ ST_Z3 = 10  # z3 T^2, 2^-40 m
 ST_Z4 = 11  # z4 T^3, 2^-42 m
 ST_INTEGRAL = 12  # PI: integral part of the command, 2^-20 rad/s
 ST_U = 13  # command sent (clipped, quantised), 2^-20 rad/s
-ST_SIZE = 14
+ST_V2_SMOOTH = 14  # front end: v2 T behind its low-pass, 2^-38 m
+ST_MOTOR = 15  # scheduled: speed of the motor in its model, 2^-20 rad/s
+ST_DISTURBANCE = 16  # scheduled: total disturbance as a speed, 2^-20 rad/s
+ST_COMMAND = 17  # command filter's output, 2^-20 rad/s
+ST_SIZE = 18
 
 # calibration
 CAL_U_LIMIT = 0  # drive's speed, 2^-20 rad/s
@@ -72,4 +78,26 @@ CAL_FB_K3 = 40  # gain, 3 wc / (b0 T^2): 2^-40 m -> 2^-20 rad/s
 CAL_FB_A1 = 42  # gain, a1n / (b0 T): 2^-38 m -> 2^-20 rad/s
 CAL_FB_A2 = 44  # gain, a2n / (b0 T^2): 2^-40 m -> 2^-20 rad/s
 CAL_FB_Z4 = 46  # gain, 1 / (b0 T^3): 2^-42 m -> 2^-20 rad/s
-CAL_SIZE = 48
+CAL_FRONT_SMOOTH = 48  # gain, share of a period in v3's time constant: 2^-38 m -> 2^-40 m
+CAL_FRONT_LEAD = 50  # gain, lead time / T: 2^-40 m -> 2^-38 m
+CAL_FRONT_EXTEND = 52  # gain, speed per rod speed: 2^-38 m -> 2^-20 rad/s
+CAL_FRONT_RETRACT = 54  # gain, speed per rod speed: 2^-38 m -> 2^-20 rad/s
+CAL_COMMAND_SMOOTH = 56  # gain, share of a period in the filter's time constant: 2^-20 -> 2^-20 rad/s
+CAL_COMMAND_SLEW = 58  # largest change of the command, 2^-20 rad/s per T
+CAL_STROKE = 59  # L, 2^-31 m
+CAL_STIFFNESS_END_A = 60  # length of the dead volume behind the piston, 2^-31 m
+CAL_STIFFNESS_END_B = 61  # length of the dead volume on the rod's side, 2^-31 m
+CAL_STIFFNESS_A = 62  # column A's share of the stiffness times its length, 2^-31 m
+CAL_STIFFNESS_B = 63  # column B's share of the stiffness times its length, 2^-31 m
+CAL_SCHEDULED_BETA1 = 64  # gain, beta01 T: 2^-31 m -> 2^-31 m
+CAL_SCHEDULED_BETA2 = 66  # gain, beta02 T^2: 2^-31 m -> 2^-38 m
+CAL_SCHEDULED_BETA3 = 68  # gain, beta03 T^3: 2^-31 m -> 2^-40 m
+CAL_SCHEDULED_BETA4 = 70  # gain, part of beta04 T / b0 in proportion to a1n: 2^-31 m -> 2^-20 rad/s
+CAL_SCHEDULED_BETA4_SOFT = 72  # gain, the other part at stiffness 1: 2^-31 m -> 2^-20 rad/s
+CAL_SCHEDULED_B0 = 74  # gain, b0 T^3 at stiffness 1: 2^-20 rad/s -> 2^-40 m
+CAL_SCHEDULED_MOTOR = 76  # gain, share of a period in the motor's time constant: 2^-20 -> 2^-20 rad/s
+CAL_SCHEDULED_K1 = 78  # gain: 2^-31 m -> 2^-20 rad/s
+CAL_SCHEDULED_K2 = 80  # gain: 2^-38 m -> 2^-20 rad/s
+CAL_SCHEDULED_K3 = 82  # gain, constant part: 2^-40 m -> 2^-20 rad/s
+CAL_SCHEDULED_K3_SOFT = 84  # gain, part in proportion to 1 / stiffness: 2^-40 m -> 2^-20 rad/s
+CAL_SIZE = 86

@@ -1,6 +1,10 @@
-"""P and PI position control; the integral part stops growing while the drive's speed limits the command."""
+"""P and PI position control, and PI with velocity feed-forward.
+
+The integral part stops growing while the drive's speed limits the command.
+"""
 
 from firmware_py.kernel.fixedpoint import gain, sat32, store
+from firmware_py.kernel.front_end import feed_forward, front_end_step
 from firmware_py.kernel.layout import CAL_P_KP, CAL_PI_KI, CAL_PI_KP, CAL_U_LIMIT, ST_INTEGRAL
 from firmware_py.kernel.machine import Array32, i64, int32
 
@@ -15,12 +19,20 @@ def p_step(calibration: Array32, setpoint: int32, position: int32) -> int32:
     return sat32(gain(calibration, CAL_P_KP, sat32(i64(setpoint) - i64(position))))
 
 
-def pi_step(calibration: Array32, state: Array32, setpoint: int32, position: int32) -> int32:
-    """Wanted speed (2^-20 rad/s) from `setpoint` and `position` (2^-31 m)."""
+def pi_step(
+    calibration: Array32, state: Array32, setpoint: int32, position: int32, feedforward: int32
+) -> int32:
+    """Wanted speed (2^-20 rad/s) from `setpoint` and `position` (2^-31 m) and a known part of it."""
     e = sat32(i64(setpoint) - i64(position))
     u_limit = calibration[CAL_U_LIMIT]
-    proportional = gain(calibration, CAL_PI_KP, e)
-    u = proportional + i64(state[ST_INTEGRAL])
+    direct = gain(calibration, CAL_PI_KP, e) + i64(feedforward)
+    u = direct + i64(state[ST_INTEGRAL])
     if (u < u_limit or e < 0) and (u > -u_limit or e > 0):
         store(state, ST_INTEGRAL, i64(state[ST_INTEGRAL]) + gain(calibration, CAL_PI_KI, e))
-    return sat32(proportional + i64(state[ST_INTEGRAL]))
+    return sat32(direct + i64(state[ST_INTEGRAL]))
+
+
+def pi_ff_step(calibration: Array32, state: Array32, limited: int32, position: int32) -> int32:
+    """Wanted speed (2^-20 rad/s) from the `limited` setpoint and `position` (2^-31 m)."""
+    front_end_step(calibration, state, limited)
+    return pi_step(calibration, state, limited, position, feed_forward(calibration, state))

@@ -12,7 +12,7 @@ from firmware_py.tuning import AdrcTuning, LimiterTuning, PiTuning, Tuning
 
 SEGMENT_STEPS = 100
 EXTREMES = np.array([-(2**31), -(2**31) + 1, -1, 0, 1, 2**31 - 1])
-LAWS = (k.LAW_P, k.LAW_PI, k.LAW_ADRC, k.LAW_ADRC, 0)
+LAWS = (k.LAW_P, k.LAW_PI, k.LAW_ADRC, k.LAW_PI_FF, k.LAW_SCHEDULED, k.LAW_SCHEDULED, 0)
 
 
 @numba.njit

@@ -19,7 +19,7 @@ from hil.supervisor import BRING_UP_PERIODS
 CONTRACT = Contract.load()
 PERIOD_NS = 1_000_000
 TABLE = ("sine", "sine_load", "lift_lower", "lift_lower_load")
-LAWS = {"p": k.LAW_P, "pi": k.LAW_PI, "adrc": k.LAW_ADRC}
+LAWS = {"p": k.LAW_P, "pi": k.LAW_PI, "adrc": k.LAW_ADRC, "pi_ff": k.LAW_PI_FF, "scheduled": k.LAW_SCHEDULED}
 
 
 # figures

@@ -1,9 +1,9 @@
-"""README's figures are those of runs made now, and of the last bench."""
+"""README's figures are those of the last evaluation, which tests/hil repeats, and of the last bench."""
 
 from readme_figures import in_readme, speed_table, table
 
 
-def test_readme_shows_what_the_scenarios_give():
+def test_readme_shows_the_last_evaluation():
     assert in_readme("figures") == table()
 
 
