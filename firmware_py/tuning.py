@@ -70,23 +70,23 @@ class FrontEndTuning:
         Time constant of the low-pass behind which its acceleration is taken, s.
     """
 
-    extend_rad_per_m: float = 1363.0
-    retract_rad_per_m: float = 1363.0
-    lead_s: float = 0.0
-    lead_filter_s: float = 5e-3
+    extend_rad_per_m: float = 1600.0
+    retract_rad_per_m: float = 1350.0
+    lead_s: float = 8e-3
+    lead_filter_s: float = 4.5e-3
 
 
 @dataclass(frozen=True, slots=True)
 class CommandFilterTuning:
     """Low-pass and slew limit on the way to the drive; a time constant of 0 makes no low-pass."""
 
-    time_constant_s: float = 0.0
+    time_constant_s: float = 2.96e-3
     slew_rad_s2: float = 2000.0
 
 
 @dataclass(frozen=True, slots=True)
 class ScheduledTuning:
-    """ADRC whose nominal model is scheduled on the position; every figure is chosen, none is the paper's.
+    """ADRC whose nominal model is scheduled on the position; every gain is fitted over the box of machines.
 
     The oil's stiffness over that at the reference position is
     S(x) = (1 / (x + end_a) + ratio / (L - x + end_b)) / (the same at the reference): eqs 20 to 22 with the
@@ -96,29 +96,33 @@ class ScheduledTuning:
     Attributes
     ----------
     b0_m_s2_per_rad : float
-        Input gain at the reference position.
-    omega_o_rad_s, omega_d_rad_s : float
-        Bandwidth of the observer for the motion, and for the disturbance:
-        beta04 = omega_d omega_o (omega_o^2 + \\|a1n(x)\\|), which puts the slowest pole near omega_d / 4.
+        Input gain at the reference position; far below the machine's 14, as for soft oil and a heavy load.
+    beta1_per_s, beta2_per_s2, beta3_per_s3 : float
+        Observer gains of eq. 26.
+    omega_d_rad_s : float
+        Bandwidth of the disturbance, about the slowest pole of the observer:
+        beta04 = omega_d (beta03 + \\|a1n(x)\\| beta01).
     k1_rad_s_per_m, k2_rad_per_m : float
         Motor speed per error of position and of velocity.
-    k3_rad_s_per_m, k3_soft_rad_s_per_m : float
-        Motor speed taken back per acceleration z3 (per m/s²: rad s/m), constant and in proportion to 1 / S.
+    k3_rad_s2_per_m, k3_soft_rad_s2_per_m : float
+        Motor speed taken back per acceleration (rad/s per m/s²), constant and in proportion to 1 / S.
     motor_time_constant_s : float
         Of the motor in the observer's model.
     """
 
-    b0_m_s2_per_rad: float = 4.44
-    omega_o_rad_s: float = 89.0
-    omega_d_rad_s: float = 31.0
-    k1_rad_s_per_m: float = 10_965.0
-    k2_rad_per_m: float = -229.5
-    k3_rad_s_per_m: float = 0.0
-    k3_soft_rad_s_per_m: float = 1.72
-    motor_time_constant_s: float = 1.55e-3
+    b0_m_s2_per_rad: float = 3.59
+    beta1_per_s: float = 366.0
+    beta2_per_s2: float = 61_280.0
+    beta3_per_s3: float = 2.109e6
+    omega_d_rad_s: float = 6.6
+    k1_rad_s_per_m: float = 12_046.0
+    k2_rad_per_m: float = -183.5
+    k3_rad_s2_per_m: float = 0.183
+    k3_soft_rad_s2_per_m: float = 1.75
+    motor_time_constant_s: float = 1.97e-3
     stroke_m: float = 0.4
-    end_a_m: float = 0.035
-    end_b_m: float = 0.030
+    end_a_m: float = 0.0409
+    end_b_m: float = 0.0244
     area_ratio: float = 0.75
     reference_m: float = 0.15
 
@@ -146,6 +150,7 @@ class LimiterTuning:
 
 P = PiTuning(31_100.0)
 PI = PiTuning(27_270.0, 39_900.0)
+PI_FF = PiTuning(16_128.0, 139_400.0)
 PI_STAR = PiTuning(20_853.0, 513_300.0)
 ADRC = AdrcTuning()
 LINEAR = AdrcTuning(  # bandwidths optimised under Ms <= 2, see hil.study.rivals
@@ -329,15 +334,14 @@ def _schedule(scheduled: ScheduledTuning) -> dict[int, int]:
 def _scheduled_observer(scheduled: ScheduledTuning, front_end: FrontEndTuning) -> dict[int, int]:
     if not scheduled.b0_m_s2_per_rad > 0:
         raise TuningError(f"tuning: b0 = {scheduled.b0_m_s2_per_rad} must be positive")
-    w = scheduled.omega_o_rad_s * PERIOD_S
     kappa = (front_end.extend_rad_per_m + front_end.retract_rad_per_m) / 2
-    disturbance = scheduled.omega_d_rad_s * PERIOD_S * scheduled.omega_o_rad_s * POSITION_LSB / U_LSB
-    soft = scheduled.omega_o_rad_s**2 / scheduled.b0_m_s2_per_rad
+    disturbance = scheduled.omega_d_rad_s * PERIOD_S * POSITION_LSB / U_LSB
+    soft = scheduled.beta3_per_s3 / scheduled.b0_m_s2_per_rad
     return (
-        _gain(k.CAL_SCHEDULED_BETA1, 4 * w)
-        | _gain(k.CAL_SCHEDULED_BETA2, 6 * w**2 * POSITION_LSB / SPEED_LSB)
-        | _gain(k.CAL_SCHEDULED_BETA3, 4 * w**3 * POSITION_LSB / ACCELERATION_LSB)
-        | _gain(k.CAL_SCHEDULED_BETA4, disturbance * kappa)
+        _gain(k.CAL_SCHEDULED_BETA1, scheduled.beta1_per_s * PERIOD_S)
+        | _gain(k.CAL_SCHEDULED_BETA2, scheduled.beta2_per_s2 * PERIOD_S**2 * POSITION_LSB / SPEED_LSB)
+        | _gain(k.CAL_SCHEDULED_BETA3, scheduled.beta3_per_s3 * PERIOD_S**3 * POSITION_LSB / ACCELERATION_LSB)
+        | _gain(k.CAL_SCHEDULED_BETA4, disturbance * kappa * scheduled.beta1_per_s)
         | _gain(k.CAL_SCHEDULED_BETA4_SOFT, disturbance * soft)
         | _gain(k.CAL_SCHEDULED_B0, scheduled.b0_m_s2_per_rad * PERIOD_S**3 * U_LSB / ACCELERATION_LSB)
         | _gain(k.CAL_SCHEDULED_MOTOR, _share(scheduled.motor_time_constant_s))
@@ -349,14 +353,24 @@ def _scheduled_feedback(scheduled: ScheduledTuning) -> dict[int, int]:
     return (
         _gain(k.CAL_SCHEDULED_K1, scheduled.k1_rad_s_per_m * POSITION_LSB / U_LSB)
         | _gain(k.CAL_SCHEDULED_K2, scheduled.k2_rad_per_m * SPEED_LSB / PERIOD_S / U_LSB)
-        | _gain(k.CAL_SCHEDULED_K3, scheduled.k3_rad_s_per_m * acceleration)
-        | _gain(k.CAL_SCHEDULED_K3_SOFT, scheduled.k3_soft_rad_s_per_m * acceleration)
+        | _gain(k.CAL_SCHEDULED_K3, scheduled.k3_rad_s2_per_m * acceleration)
+        | _gain(k.CAL_SCHEDULED_K3_SOFT, scheduled.k3_soft_rad_s2_per_m * acceleration)
     )
 
 
 TUNINGS = {
     "paper": Tuning(),
+    "robust": Tuning(law=k.LAW_SCHEDULED),
     "pi_star": Tuning(law=k.LAW_PI, pi=PI_STAR),
+    "pi_ff": Tuning(
+        law=k.LAW_PI_FF,
+        pi=PI_FF,
+        front_end=FrontEndTuning(1367.0, 1367.0, lead_s=0.0),
+        command_filter=CommandFilterTuning(0.96e-3, 1e5),
+    ),
     "linear": Tuning(adrc=LINEAR),
 }
-"""The built-in calibrations by name; each has the law it is named for as its default."""
+"""The built-in calibrations by name; each has the law it is named for as its default.
+
+pi_ff is the rival with the plain velocity feed-forward of section 4's gains made to hold over the box.
+"""

@@ -169,17 +169,16 @@ def scheduled_model(
     stiff = gains.stiffness(position_m)
     b0 = gains.b0_m_s2_per_rad * stiff
     kappa = (front_end.extend_rad_per_m + front_end.retract_rad_per_m) / 2
-    w_o = gains.omega_o_rad_s
+    betas = gains.beta1_per_s, gains.beta2_per_s2, gains.beta3_per_s3
+    beta4 = gains.omega_d_rad_s * (gains.beta3_per_s3 / b0 + kappa * gains.beta1_per_s)
     motor = _lag_share(gains.motor_time_constant_s)
-    injection = PERIOD_S * np.array(
-        [4 * w_o, 6 * w_o**2, 4 * w_o**3, gains.omega_d_rad_s * w_o * (kappa + w_o**2 / b0), 0.0]
-    )
+    injection = PERIOD_S * np.array([*betas, beta4, 0.0])
     observe = np.eye(5, 6)
     observe[:2, 1:3] += PERIOD_S * np.eye(2)
     observe[4, 4:] = 1.0 - motor, motor
     observe[2] += PERIOD_S * b0 * (observe[4] + np.array([0.0, -kappa, 0.0, 1.0, 0.0, 0.0]))
     observe[:, 0] -= injection
-    damping = gains.k3_rad_s_per_m + gains.k3_soft_rad_s_per_m / stiff
+    damping = gains.k3_rad_s2_per_m + gains.k3_soft_rad_s2_per_m / stiff
     feedback = -np.array([gains.k1_rad_s_per_m, gains.k2_rad_per_m, damping, 1.0, 0.0])
     return observer_with_feedback(observe, injection, feedback, _lag_share(command_filter.time_constant_s))
 
