@@ -19,6 +19,7 @@ from hil.study.box import load_box
 from hil.study.disturbance import observer_error, true_disturbance_m_s3
 from hil.study.runs import FAILED_RMS_MM
 from hil.study.stability import StabilityMap, map_machines, stability_maps
+from hil.study.state_space import Validation
 from hil.study.sweep import Sweep
 
 METRICS = {  # key in result.json and tables.json: what it is, decimals
@@ -88,8 +89,36 @@ class Run:
     trace: Trace
 
 
-Runs = Mapping[tuple[str, str], Run]
-"""By scenario and label."""
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """All that was computed.
+
+    Attributes
+    ----------
+    taking_part : sequence of Contestant
+        The paper's three, and others.
+    scenarios : sequence of str
+        Some of `hil.study.paper.CASES`.
+    runs : mapping of Run
+        By scenario and label.
+    swept : mapping of mapping
+        By label, from `hil.study.sweep.Sweep.summary`.
+    maps : mapping of StabilityMap
+        By label.
+    validation : Validation
+        Figure 3b.
+    """
+
+    taking_part: Sequence[Contestant]
+    scenarios: Sequence[str]
+    runs: Mapping[tuple[str, str], Run]
+    swept: Mapping[str, Mapping[str, Any]]
+    maps: Mapping[str, StabilityMap]
+    validation: Validation
+
+    def traces(self, scenario: str) -> dict[str, Trace]:
+        """Return a scenario's traces by label."""
+        return {one.label: self.runs[scenario, one.label].trace for one in self.taking_part}
 
 
 def contestants() -> tuple[Contestant, ...]:
@@ -153,27 +182,10 @@ def stability_of(taking_part: Sequence[Contestant]) -> dict[str, StabilityMap]:
     return stability_maps(tunings, map_machines())
 
 
-def tables_of(
-    taking_part: Sequence[Contestant],
-    scenarios: Sequence[str],
-    runs: Runs,
-    swept: Mapping[str, Mapping[str, Any]],
-    maps: Mapping[str, StabilityMap],
-) -> dict[str, Any]:
-    """Return all figures of the evaluation, as written to ``tables.json``, with `DIGITS` digits.
-
-    Parameters
-    ----------
-    taking_part : sequence of Contestant
-    scenarios : sequence of str
-        Some of `hil.study.paper.CASES`.
-    runs : mapping of Run
-    swept : mapping of mapping
-        By label, from `hil.study.sweep.Sweep.summary`.
-    maps : mapping of StabilityMap
-        By label.
-    """
-    scenario_tables = {name: _scenario_table(name, runs, taking_part) for name in scenarios}
+def tables_of(evaluation: Evaluation) -> dict[str, Any]:
+    """Return all figures of the evaluation, as written to ``tables.json``, with `DIGITS` digits."""
+    taking_part, runs = evaluation.taking_part, evaluation.runs
+    scenario_tables = {name: _scenario_table(name, evaluation) for name in evaluation.scenarios}
     best = [label for table in scenario_tables.values() for row in table["best"].values() for label in row]
     tables = {
         "paper": f"{paper.PUBLISHED}: {paper.TITLE}",
@@ -200,7 +212,7 @@ def tables_of(
         "load_effect_percent": {
             name: _load_effect(runs, name, loaded)
             for name, loaded in paper.WITH_LOAD.items()
-            if name in scenarios and loaded in scenarios
+            if {name, loaded} <= scenario_tables.keys()
         },
         "robustness": {
             "scenario": SWEPT,
@@ -209,10 +221,11 @@ def tables_of(
             "failed_above_mm": FAILED_RMS_MM,
             "contestants": {
                 label: {key: summary[key] for key in ("failures", "rms_mm", "chatter_rpm")}
-                for label, summary in swept.items()
+                for label, summary in evaluation.swept.items()
             },
         },
-        "stability": {label: one.summary() for label, one in maps.items()},
+        "stability": {label: one.summary() for label, one in evaluation.maps.items()},
+        "state_space": evaluation.validation.figures(),
     }
     return dict(_shortened(tables))
 
@@ -226,10 +239,10 @@ def _shortened(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
 
 
-def _scenario_table(name: str, runs: Runs, taking_part: Sequence[Contestant]) -> dict[str, Any]:
+def _scenario_table(name: str, evaluation: Evaluation) -> dict[str, Any]:
     case, scenario = paper.CASES[name], load_scenario(name)
-    adrc = runs[name, "ADRC"].trace
-    ours = {one.label: runs[name, one.label].figures for one in taking_part}
+    adrc = evaluation.traces(name)["ADRC"]
+    ours = {one.label: evaluation.runs[name, one.label].figures for one in evaluation.taking_part}
     return {
         "title": case.title,
         "table": case.table,
@@ -265,7 +278,7 @@ def _reduction(adrc: float, rival: float) -> float:
     return 100.0 * (1.0 - adrc / rival)
 
 
-def _load_effect(runs: Runs, free: str, loaded: str) -> dict[str, dict[str, float]]:
+def _load_effect(runs: Mapping[tuple[str, str], Run], free: str, loaded: str) -> dict[str, dict[str, float]]:
     """Return by how many percent the load changes the RMS error, in the paper and here."""
     papers = {name: load_scenario(name).paper for name in (free, loaded)}
     effects = {}

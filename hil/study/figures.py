@@ -1,6 +1,6 @@
 """The evaluation's figures. Imports matplotlib; import it only where something is drawn."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from hil.measure import M_TO_MM, Trace
-from hil.study.evaluation import OBSERVED, TRUE, Contestant, Runs
+from hil.study.evaluation import OBSERVED, TRUE
 
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (  # Okabe and Ito, told apart by the colour-blind
     "#000000",
@@ -68,9 +68,9 @@ def save(directory: Path, name: str, draw: Draw) -> list[Path]:
     return paths
 
 
-def colours(taking_part: Sequence[Contestant]) -> dict[str, str]:
+def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return a colour for each contestant, by label."""
-    others = (one.label for one in taking_part if one.label not in _COLOURS)
+    others = (label for label in labels if label not in _COLOURS)
     return _COLOURS | dict(zip(others, cycle(_MORE_COLOURS), strict=False))
 
 
@@ -122,29 +122,35 @@ def tracking(traces: Mapping[str, Trace]) -> Draw:
     return _stacked(panels)
 
 
-def rivals(names: Sequence[str], runs: Runs, taking_part: Sequence[Contestant]) -> Draw:
-    """Return what draws the error of all contestants but P and PI, a panel for each scenario."""
-    colour = colours(taking_part)
+def rivals(traces: Mapping[str, Mapping[str, Trace]]) -> Draw:
+    """Return what draws the error of all contestants but P and PI, a panel for each scenario.
+
+    Parameters
+    ----------
+    traces : mapping of mapping of Trace
+        By scenario and label.
+    """
 
     def panel_of(name: str) -> Callable[[Axes], None]:
         def panel(axes: Axes) -> None:
-            for one in taking_part:
-                if one.label not in ("P", "PI"):
-                    trace = runs[name, one.label].trace
-                    _line(axes, trace, trace["error_m"] * M_TO_MM, one.label, colour[one.label], lw=0.9)
+            colour = colours(traces[name])
+            for label, trace in traces[name].items():
+                if label not in ("P", "PI"):
+                    _line(axes, trace, trace["error_m"] * M_TO_MM, label, colour[label], lw=0.9)
             axes.set_ylabel("error / mm")
             axes.set_title(name, loc="left", fontsize=9)
-            if name == names[0]:
+            if name == next(iter(traces)):
                 _legend(axes)
 
         return panel
 
-    return _stacked([panel_of(name) for name in names], lettered=False)
+    return _stacked([panel_of(name) for name in traces], lettered=False)
 
 
-def comparison(tables: dict[str, Any], taking_part: Sequence[Contestant]) -> Draw:
+def comparison(tables: Mapping[str, Any]) -> Draw:
     """Return what draws RMS and maximum error of all contestants beside the paper's, on a log scale."""
-    colour = colours(taking_part)
+    contestants = tables["contestants"]
+    colour = colours(contestants)
     scenarios = tables["scenarios"]
 
     def draw(figure: Figure) -> None:
@@ -154,16 +160,17 @@ def comparison(tables: dict[str, Any], taking_part: Sequence[Contestant]) -> Dra
             (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")),
             strict=True,
         ):
-            for row, one in enumerate(taking_part):
-                offset = (row - (len(taking_part) - 1) / 2) * 0.8 / len(taking_part)
+            for row, (label, one) in enumerate(contestants.items()):
+                offset = (row - (len(contestants) - 1) / 2) * 0.8 / len(contestants)
                 y = np.arange(len(scenarios)) + offset
-                ours = [table["ours"][one.label][metric] for table in scenarios.values()]
-                axes.plot(ours, y, "o", color=colour[one.label], ms=5, label=one.label)
-                if one.in_paper:
-                    theirs = [table["paper"][one.law][metric] for table in scenarios.values()]
-                    axes.plot(theirs, y, "D", color=colour[one.label], mfc="none", ms=5)
+                ours = [table["ours"][label][metric] for table in scenarios.values()]
+                axes.plot(ours, y, "o", color=colour[label], ms=5, label=label)
+                if one["in_paper"]:
+                    theirs = [table["paper"][one["law"]][metric] for table in scenarios.values()]
+                    axes.plot(theirs, y, "D", color=colour[label], mfc="none", ms=5)
             axes.plot([], [], "D", color=BLACK, mfc="none", ms=5, label="paper")
             axes.set_xscale("log")
+            axes.margins(x=0.05)
             axes.set_xlabel(title)
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.xaxis.set_major_formatter("{x:g}")

@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,7 @@ from hil.run.stopping import StopFlag
 from hil.study import paper
 
 if TYPE_CHECKING:
-    from hil.study.evaluation import Contestant, Runs
-    from hil.study.stability import StabilityMap
+    from hil.study.evaluation import Contestant, Evaluation
 
 DEFAULT_OUT = Path("out/reproduce")
 _POLL_S = 0.1
@@ -71,17 +70,24 @@ def evaluate(
     made : list of Path
         The files.
     """
-    from hil.study.evaluation import play, stability_of, tables_of
+    from hil.study.evaluation import Evaluation, play, stability_of, tables_of
     from hil.study.report_page import page
+    from hil.study.state_space import validate
 
     pairs = [(name, one) for name in scenarios for one in taking_part]
-    played = _all(cores, [partial(play, pair) for pair in pairs], stopped, progress, "playing")
-    runs = {(name, one.label): run for (name, one), run in zip(pairs, played, strict=True)}
-    swept = _swept(taking_part, cores, stopped, progress)
-    maps = stability_of(taking_part)
-    tables = tables_of(taking_part, scenarios, runs, swept, maps)
-    drawings = _drawings(folder, taking_part, scenarios, runs, maps, tables)
-    pictures = [path for paths in _all(cores, drawings, stopped, progress, "drawing") for path in paths]
+    tasks: list[Callable[[], Any]] = [validate, *(partial(play, pair) for pair in pairs)]
+    validation, *played = _all(cores, tasks, stopped, progress, "playing")
+    evaluation = Evaluation(
+        taking_part=taking_part,
+        scenarios=scenarios,
+        runs={(name, one.label): run for (name, one), run in zip(pairs, played, strict=True)},
+        swept=_swept(taking_part, cores, stopped, progress),
+        maps=stability_of(taking_part),
+        validation=validation,
+    )
+    tables = tables_of(evaluation)
+    drawn = _all(cores, _drawings(folder, evaluation, tables), stopped, progress, "drawing")
+    pictures = [path for paths in drawn for path in paths]
     made = [folder / "tables.json", folder / "report.html"]
     made[0].write_text(_json(tables), encoding="utf-8")
     svg = {path.stem: path for path in pictures if path.suffix == ".svg"}
@@ -115,33 +121,30 @@ def _swept(
 
 
 def _drawings(
-    folder: Path,
-    taking_part: Sequence["Contestant"],
-    scenarios: Sequence[str],
-    runs: "Runs",
-    maps: Mapping[str, "StabilityMap"],
-    tables: dict[str, Any],
+    folder: Path, evaluation: "Evaluation", tables: dict[str, Any]
 ) -> list[Callable[[], list[Path]]]:
+    """Return what draws each picture, the slowest first."""
     from hil.study import figures
     from hil.study.stability import heat_map
+    from hil.study.state_space import figure_3b
 
-    def drawing(name: str, drawer: Callable[..., figures.Draw], *content: Any) -> Callable[[], list[Path]]:
-        return partial(_draw, folder, name, drawer, content)
-
-    trackings = [
-        drawing(
-            f"figure_{paper.CASES[name].figure}",
-            figures.tracking,
-            {label: runs[name, label].trace for label in ("P", "PI", "ADRC")},
-        )
-        for name in scenarios
+    traces = {name: evaluation.traces(name) for name in evaluation.scenarios}
+    papers = [one.label for one in evaluation.taking_part if one.in_paper]
+    pictures: list[tuple[str, Callable[..., figures.Draw], tuple[Any, ...]]] = [
+        ("stability", heat_map, (evaluation.maps,)),
+        *(
+            (
+                f"figure_{paper.CASES[name].figure}",
+                figures.tracking,
+                ({label: by_label[label] for label in papers},),
+            )
+            for name, by_label in traces.items()
+        ),
+        ("figure_3b", figure_3b, (evaluation.validation,)),
+        ("rivals", figures.rivals, (traces,)),
+        ("comparison", figures.comparison, (tables,)),
     ]
-    return [
-        drawing("stability", heat_map, maps),
-        *trackings,
-        drawing("rivals", figures.rivals, scenarios, runs, taking_part),
-        drawing("comparison", figures.comparison, tables, taking_part),
-    ]
+    return [partial(_draw, folder, *picture) for picture in pictures]
 
 
 def _draw(folder: Path, name: str, drawer: Callable[..., Any], content: Sequence[Any]) -> list[Path]:

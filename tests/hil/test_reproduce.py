@@ -25,13 +25,14 @@ from firmware_py import tuning
 from hil import cli
 from hil.run.stopping import StopFlag
 from hil.study import evaluation, paper
-from hil.study.evaluation import METRICS, OBSERVED, TRUE, Contestant, Run, contestants, tables_of
+from hil.study.evaluation import METRICS, OBSERVED, TRUE, Contestant, Evaluation, Run, contestants, tables_of
 from hil.study.report_page import page
 from hil.study.reproduce import evaluate, summary
 from hil.study.runs import all_cores
+from hil.study.state_space import Validation
 
 ROOT = Path(__file__).parents[2]
-PICTURES = {"figure_5", "figure_6", "figure_7", "figure_8", "rivals", "comparison", "stability"}
+PICTURES = {"figure_3b", "figure_5", "figure_6", "figure_7", "figure_8", "rivals", "comparison", "stability"}
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +154,9 @@ def test_who_is_best_is_best_whoever_it_is():
         )
         for label, rms_mm in {"P": 4.0, "PI": 3.0, "ADRC": 2.0, "rival": 1.0}.items()
     }
+    no_validation = Validation(np.empty(0), np.empty(0), {}, {})
     taking_part = (*contestants()[:3], Contestant("rival", "pi_star", "pi"))
-    tables = tables_of(taking_part, ["sine"], made_up, {}, {})
+    tables = tables_of(Evaluation(taking_part, ["sine"], made_up, {}, {}, no_validation))
     assert tables["scenarios"]["sine"]["best"] == {
         "rms_mm": ["rival"],
         "max_mm": ["P", "PI", "ADRC", "rival"],
