@@ -2,10 +2,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run test test-long test-vcan check bench figures clean
+.PHONY: run reproduce test test-long test-vcan check bench figures clean
 
 run: $(READY)  ## the main job: the 10 s sine under ADRC, three processes in lock-step
 	$(BIN)/hil run sine
+
+reproduce: $(READY)  ## the paper's evaluation over the bus: out/reproduce/report.html
+	$(BIN)/hil reproduce
 
 test: $(READY)  ## all tests that need nothing but this machine
 	$(BIN)/python -m pytest
@@ -27,7 +30,7 @@ check: $(READY)  ## style, types, import rules, kernel subset
 bench: $(READY)  ## speed figures, measured side by side
 	$(BIN)/python tests/tools/bench.py
 
-figures: $(READY)  ## rewrite the figures in README from runs
+figures: $(READY)  ## rewrite the figures in README from a new evaluation
 	$(BIN)/python tests/tools/readme_figures.py --write
 
 $(READY): pyproject.toml constraints.txt

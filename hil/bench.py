@@ -9,12 +9,12 @@ from dbc.codec import signal_name
 from dbc.contract import Contract
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
-from hil.bus.wire import FrameFault, Port, Wire
-from hil.measure import M_TO_MM, Trace, figures_of, timing_in, trace_of
+from hil.bus.wire import ErrorState, FrameFault, Port, Wire
+from hil.measure import M_TO_MM, Trace, figures_of, setting_of, timing_in, trace_of
 from hil.report import OutputDirectory
 from hil.run.options import SIDES, BenchError, Recording
 from hil.run.rig import Rig
-from hil.scenario import MAX_LOAD_N, PERIOD_S, TimingLimits
+from hil.scenario import MAX_LOAD_N, PERIOD_S, TimingLimits, controller_of
 from hil.signals import Series, signal_of
 from hil.supervisor import BRING_UP_PERIODS, Reference
 from hil.timing import Figure, Timing
@@ -38,7 +38,7 @@ class Bench:
     rig : Rig
         Bus and nodes; its sessions come one after another.
     controller : str
-        Control law, one of `hil.scenario.CONTROLLERS`.
+        Control law, one of `hil.scenario.CONTROLLERS`; by default that of the rig's tuning.
     position_m : float
         Where the machine starts.
     bit_rate : int, optional
@@ -51,15 +51,16 @@ class Bench:
     """
 
     def __init__(
-        self, rig: Rig, controller: str = "adrc", position_m: float = 0.0, bit_rate: int | None = None
+        self, rig: Rig, controller: str = "", position_m: float = 0.0, bit_rate: int | None = None
     ) -> None:
         if not 0.0 <= position_m <= STROKE_M:
             raise ValueError(f"position_m is {position_m}, must be from 0 to {STROKE_M} m")
         self.mode = rig.mode
         self.bit_rate = bit_rate or rig.bit_rate
-        self.controller = controller
+        self.controller = controller or controller_of(rig.options.tuning.calibration.law)
+        self._setting = setting_of(rig.options)
         self._contract = rig.contract
-        self._session = rig.begin(controller, position_m, bit_rate)
+        self._session = rig.begin(self.controller, position_m, bit_rate)
         self._supervisor = self._session.supervisor
         self._period = BRING_UP_PERIODS
         self._recording: Recording | None = None
@@ -149,6 +150,20 @@ class Bench:
         """Let the next frames of a message carry the payload of the last one, counter and CRC included."""
         self._spoil(message, FrameFault.REPEAT, 0, count)
 
+    def destroy(self, message: str, bit: int = 20, count: int = 1) -> None:
+        """Hit the next attempts to send a message with a bad bit: error frames end them, others follow."""
+        if not 0 <= bit < 130:
+            raise ValueError(f"a frame has bits 0 to 129, not {bit}")
+        self._spoil(message, FrameFault.DESTROY, bit, count)
+
+    def disturb(self, bit_error_rate: float, duration_s: float, seed: int = 0) -> None:
+        """Let every bit on the wire be bad with a probability, for some time."""
+        self._wire("disturb").disturb(bit_error_rate, round(duration_s * 1e9), seed)
+
+    def error_state(self, node: str) -> ErrorState:
+        """Return error counters and state of the CAN controller of "plant" or "controller"."""
+        return self._wire("error_state").error_state(self._port(node))
+
     def power_off(self, node: str) -> None:
         """Cut "plant" or "controller" off."""
         self._wire("power_off").detach(self._port(node))
@@ -223,17 +238,17 @@ class Bench:
     def controller_state(self) -> ControllerState | None:
         """State of the controller: now, or in real time as last reported (every 100 ms)."""
         value = self._newest("controller_state", "ControllerStatus.State")
-        return None if np.isnan(value) else ControllerState(int(value))
+        return None if value is None else ControllerState(value)
 
     @property
     def controller_faults(self) -> set[str]:
         """Names of the controller's fault signals that are set; as up to date as `controller_state`."""
         if "controller_faults" in self.trace:
             bits = self._newest("controller_faults", "")
-            return {signal_name(str(fault.name)) for fault in Fault(0 if np.isnan(bits) else int(bits))}
+            return {signal_name(str(fault.name)) for fault in Fault(bits or 0)}
         signals = self._contract.message("ControllerStatus").signals
         flags = [name for name, signal in signals.items() if signal.length == 1]
-        return {name for name in flags if self.signal(f"ControllerStatus.{name}").last == 1}
+        return {name for name in flags if self._newest("", f"ControllerStatus.{name}") == 1}
 
     def signal(self, name: str) -> Series:
         """Return ``Message.Signal`` from the bus, in its unit, over the time since time 0."""
@@ -264,7 +279,7 @@ class Bench:
         figures = figures_of(
             self.recording, self.trace, self.timing, self._contract, self.bit_rate, self.mode
         )
-        return {"scenario": name, "controller": self.controller, **figures, "paper": None}
+        return {"scenario": name, "controller": self.controller, **self._setting, **figures, "paper": None}
 
     def write(self, folder: Path, name: str) -> list[Path]:
         """Leave figures, trace, bus log and picture in a folder; return the files."""
@@ -272,7 +287,8 @@ class Bench:
             return directory.write(self.result(name), self.trace, self.recording.traffic)
 
     def end(self) -> None:
-        """Leave the machine disabled; nothing runs afterwards."""
+        """Keep what there is and leave the machine disabled; nothing runs afterwards."""
+        self._recording = self.recording  # the rig forgets it when another run begins
         self._session.end()
 
     def _go_on(self) -> None:
@@ -285,10 +301,10 @@ class Bench:
     def _column(self, name: str, factor: float) -> Series:
         return Series(self.trace["time_s"], self.trace[name] * factor)
 
-    def _newest(self, column: str, signal: str) -> float:
-        if column in self.trace:
-            return Series(self.trace["time_s"], self.trace[column]).last
-        return self.signal(signal).last
+    def _newest(self, column: str, signal: str) -> int | None:
+        """Return the newest known value of a trace column, or where there is none of a signal."""
+        series = self._column(column, 1.0) if column in self.trace else self.signal(signal)
+        return int(series.last) if series.known.size else None
 
     def _spoil(self, message: str, fault: FrameFault, argument: int, count: int) -> None:
         if count < 1:

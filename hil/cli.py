@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
@@ -40,7 +41,7 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
-from hil.study import sweep_command
+from hil.study import reproduce, rta_command, sweep_command
 from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
@@ -76,6 +77,9 @@ def main(argv: list[str] | None = None) -> int:
     except REFUSALS as error:
         print(f"hil: {error}", file=sys.stderr)
         return EXIT_USAGE
+    except BrokenExecutor as error:
+        print(f"hil: a worker process was lost: {error}", file=sys.stderr)
+        return EXIT_BROKEN
     return code
 
 
@@ -133,6 +137,9 @@ def _parser() -> argparse.ArgumentParser:
     status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
     status.set_defaults(command=_vcan_status)
 
+    reproduce.add_command(commands)
+    rta_command.add_command(commands)
+
     listing = commands.add_parser("list", help="list the built-in scenarios")
     listing.set_defaults(command=_list)
     return parser
@@ -161,6 +168,8 @@ def _run(arguments: argparse.Namespace) -> int:
     bus = arguments.interface, arguments.channel, arguments.bitrate
     if arguments.mode != "realtime" and arguments.interface is not None:
         raise BenchError(f"--interface needs --mode realtime: {arguments.mode} runs in virtual time")
+    if arguments.mode != "realtime" and arguments.rt_ratio != 1:
+        raise BenchError("--rt-ratio needs --mode realtime: virtual time has no pace")
     if arguments.interface is not None:
         bus = bus_settings(*bus)
     interface, channel, bit_rate = bus
@@ -223,13 +232,16 @@ def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
 
 
 def _table(result: dict[str, Any]) -> Table:
-    table = Table(title=f"{result['scenario']}, {result['controller']}, {result['mode']}")
+    table = Table(
+        title=f"{result['scenario']}, {result['controller']} ({result['tuning']}), {result['mode']}"
+    )
     table.add_column("")
     table.add_column("this run", justify="right")
     table.add_column("limit", justify="right")
     table.add_column("paper", justify="right")
+    judged = (result["limits"], result["paper"]) if result["complete"] else (None, None)
     for key, label in (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")):
-        limit, paper = ((source or {}).get(key) for source in (result["limits"], result["paper"]))
+        limit, paper = ((source or {}).get(key) for source in judged)
         table.add_row(label, *(_number(value, ".4f") for value in (result[key], limit, paper)))
     latency = result["timing"]["latency_us"]
     rows = (
@@ -237,6 +249,8 @@ def _table(result: dict[str, Any]) -> Table:
         ("bus load / %", _number(result["bus_load_percent"], ".1f")),
         ("feedback to command, median / µs", _number(latency["p50"], ".0f")),
         ("feedback to command, maximum / µs", _number(latency["max"], ".0f")),
+        ("missed periods", str(result["timing"]["missed_periods"])),
+        ("late periods", str(result["timing"]["late_periods"])),
         ("start-up / s", _number(result["startup_s"], ".1f")),
         ("times real time", _number(result["realtime_factor"], ".1f")),
     )

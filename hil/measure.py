@@ -112,15 +112,15 @@ def figures_of(
     the plant left no record, the measured one on the bus.
     """
     error_mm = Series(trace["time_s"], trace["error_m"] * M_TO_MM)
-    speed_steps_rpm = np.diff(trace["target_velocity_rpm"])
+    chatter_rpm = Series(trace["time_s"][1:], np.diff(trace["target_velocity_rpm"]))
     return {
         "mode": mode,
         "complete": not recording.ending,
         "ending": recording.ending,
         "position": "plant" if recording.plant is not None else "bus",
-        "rms_mm": _finite(error_mm.rms),
-        "max_mm": _finite(error_mm.max),
-        "chatter_rpm_per_period": _finite(Series(trace["time_s"][1:], speed_steps_rpm).rms),
+        "rms_mm": error_mm.rms if error_mm.known.size else None,
+        "max_mm": error_mm.max if error_mm.known.size else None,
+        "chatter_rpm_per_period": chatter_rpm.rms if chatter_rpm.known.size else None,
         "bit_rate": bit_rate,
         "bus_load_percent": bus_load_percent(recording, contract, bit_rate),
         "timing": timing.summary(),
@@ -233,7 +233,3 @@ def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: 
         recording.start_ns + periods * PERIOD_NS,
         None if controller is None else controller["time_ns"] + PHASE_NS,
     )
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

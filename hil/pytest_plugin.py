@@ -9,7 +9,8 @@ A test that takes the fixture `bench` gets a machine that is brought up and enab
         bench.run(2.0)
         assert bench.error_mm.max < 1.45
 
-``@pytest.mark.bench(controller="pi", position_m=0.2, bit_rate=500_000)`` says how it begins, and
+``@pytest.mark.bench(controller="pi", position_m=0.2, bit_rate=500_000)`` says how it begins,
+``@pytest.mark.bench(machine={"mass": 1.5}, tuning="pi_star")`` on what machine and under which tuning, and
 ``@pytest.mark.needs("wire_faults")`` what only some interfaces have: where they have not, the test is not
 applicable, and counted as such.
 """
@@ -17,8 +18,9 @@ applicable, and counted as such.
 import argparse
 import os
 import shlex
+import sys
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,10 +28,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    from firmware_py.chosen_tuning import ChosenTuning
     from hil.bench import Bench
     from hil.run.rig import Rig
+    from plant_sim.machine import Machine
 
 MODES = ("inprocess", "lockstep", "realtime")
+BEGINNINGS = ("controller", "position_m", "bit_rate", "machine", "tuning")
 STARTS = {"both": ("plant", "controller"), "none": (), "plant": ("plant",), "controller": ("controller",)}
 
 _VIRTUAL = frozenset({"virtual_time", "wire_faults", "power"})
@@ -40,6 +45,8 @@ CAPABILITIES = {  # what a test may need, by interface
     "socketcan": frozenset({"wall_time", "real_bus"}),
 }
 _OTHER_ADAPTER = frozenset({"wall_time", "real_bus"})
+OF_SIDES = {"plant": "machine", "controller": "tuning"}
+"""What a test may choose, and so need, of a side that is started here."""
 
 _not_applicable = pytest.StashKey[Counter[str]]()
 _applicable = pytest.StashKey[int]()
@@ -71,12 +78,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register markers, and refuse options that do not go together."""
     config.addinivalue_line(
-        "markers", "bench(controller='adrc', position_m=0.0, bit_rate=None): how the bench begins"
+        "markers",
+        "bench(controller=..., position_m=0.0, bit_rate=None, machine={}, tuning=...): how the bench begins",
     )
     config.addinivalue_line("markers", "needs(*what): not applicable where the interface lacks it")
     if config.getoption("hil_interface") and config.getoption("hil_mode") != "realtime":
         raise pytest.UsageError("--hil-interface needs --hil-mode realtime")
-    _ratio(config)
+    if _ratio(config) != 1 and config.getoption("hil_mode") != "realtime":
+        raise pytest.UsageError("--rt-ratio needs --hil-mode realtime: virtual time has no pace")
 
 
 def interface_of(config: pytest.Config) -> str:
@@ -89,12 +98,18 @@ def interface_of(config: pytest.Config) -> str:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect what needs what the interface lacks."""
     has = CAPABILITIES.get(interface_of(config), _OTHER_ADAPTER)
+    has |= {OF_SIDES[side] for side in _started(config)}
+    known = sorted({*OF_SIDES.values(), *(need for needs in CAPABILITIES.values() for need in needs)})
     lacking: Counter[str] = Counter()
     out = []
     for item in filter(_has_bench, items):
         needs = [need for marker in item.iter_markers("needs") for need in marker.args]
-        if unknown := [need for need in needs if not any(need in all_ for all_ in CAPABILITIES.values())]:
-            raise pytest.UsageError(f"{item.nodeid}: nothing has {unknown[0]!r}")
+        if begins := item.get_closest_marker("bench"):
+            needs += [need for need in OF_SIDES.values() if need in begins.kwargs]
+        if unknown := [need for need in needs if need not in known]:
+            raise pytest.UsageError(
+                f"{item.nodeid}: nothing has {unknown[0]!r}: choose from {', '.join(known)}"
+            )
         if missing := [need for need in needs if need not in has]:
             lacking[missing[0]] += 1
             out.append(item)
@@ -102,6 +117,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=out)
     items[:] = [item for item in items if item not in out]
     config.stash[_applicable] = sum(map(_has_bench, items))
+
+
+def _started(config: pytest.Config) -> tuple[str, ...]:
+    """Return the sides that are started here."""
+    return STARTS[config.getoption("hil_start") or ("none" if config.getoption("hil_interface") else "both")]
 
 
 def _has_bench(item: pytest.Item) -> bool:
@@ -150,21 +170,27 @@ def pytest_runtest_makereport(
 @pytest.fixture(scope="session")
 def hil_rig(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> "Iterator[Callable[[], Rig]]":
-    """Return what gives the rig of this test session; one that has lost a process is replaced."""
+) -> "Iterator[Callable[..., Rig]]":
+    """Return what gives the rig of this test session; a broken one, or another machine's, is replaced."""
     import can
 
+    from firmware_py.chosen_tuning import chosen_tuning
     from hil.bus.link import LinkError
     from hil.run.options import BenchError
     from hil.run.rig import RigKeeper
+    from plant_sim.machine import Machine
 
-    def rig() -> "Rig":
+    def rig(machine: Mapping[str, Any] | None = None, tuning: str | Path | None = None) -> "Rig":
+        chosen = chosen_tuning(file=tuning) if isinstance(tuning, Path) else chosen_tuning(tuning)
         try:
-            return keeper.rig()
+            return keeper.rig(Machine.from_table(machine or {}), chosen)
         except (BenchError, LinkError, can.CanInitializationError) as error:
             pytest.exit(f"hil: {error}", returncode=2)
 
-    with RigKeeper(lambda: _new_rig(request.config, tmp_path_factory.mktemp("rig"))) as keeper:
+    def new_rig(machine: Machine, tuning: "ChosenTuning") -> "Rig":
+        return _new_rig(request.config, tmp_path_factory.mktemp("rig"), machine, tuning)
+
+    with RigKeeper(new_rig) as keeper:
         yield rig
 
 
@@ -175,14 +201,16 @@ def _benches() -> "list[Bench]":
 
 
 @pytest.fixture
-def bench_at(hil_rig: "Callable[[], Rig]", _benches: "list[Bench]") -> "Iterator[Callable[..., Bench]]":
-    """Return what makes a bench: ``bench_at(controller="adrc", position_m=0.0, bit_rate=None)``."""
+def bench_at(hil_rig: "Callable[..., Rig]", _benches: "list[Bench]") -> "Iterator[Callable[..., Bench]]":
+    """Return what makes a bench, with the arguments of the marker ``bench``."""
     from hil.bench import Bench
 
-    def bench_at(**how: Any) -> "Bench":
+    def bench_at(
+        machine: Mapping[str, Any] | None = None, tuning: str | Path | None = None, **how: Any
+    ) -> "Bench":
         for earlier in _benches:
             earlier.end()
-        bench = Bench(hil_rig(), **how)
+        bench = Bench(hil_rig(machine, tuning), **how)
         _benches.append(bench)
         return bench
 
@@ -195,17 +223,19 @@ def bench_at(hil_rig: "Callable[[], Rig]", _benches: "list[Bench]") -> "Iterator
 def bench(request: pytest.FixtureRequest, bench_at: "Callable[..., Bench]") -> "Bench":
     """Return a bench that is brought up and enabled; the marker `bench` says how it begins."""
     marker = request.node.get_closest_marker("bench")
-    return bench_at(**(marker.kwargs if marker else {}))
+    how = marker.kwargs if marker else {}
+    if unknown := [key for key in how if key not in BEGINNINGS]:
+        pytest.fail(f"a bench takes no {unknown[0]!r}: choose from {', '.join(BEGINNINGS)}", pytrace=False)
+    return bench_at(**how)
 
 
-def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
+def _new_rig(config: pytest.Config, directory: Path, machine: "Machine", tuning: "ChosenTuning") -> "Rig":
     from hil.bus.opening import bus_settings
     from hil.run.options import RigOptions
     from hil.run.rigs import RIGS
 
     interface, channel = config.getoption("hil_interface"), config.getoption("hil_channel")
     bit_rate = config.getoption("hil_bitrate")
-    start = config.getoption("hil_start") or ("none" if interface else "both")
     if interface:
         interface, channel, bit_rate = bus_settings(interface, channel, bit_rate)
     options = RigOptions(
@@ -214,7 +244,9 @@ def _new_rig(config: pytest.Config, directory: Path) -> "Rig":
         interface=interface,
         channel=channel,
         rt_ratio=_ratio(config),
-        started=frozenset(STARTS[start]),
+        started=frozenset(_started(config)),
+        machine=machine,
+        tuning=tuning,
         start_timeout_s=config.getoption("hil_start_timeout"),
     )
     return RIGS[config.getoption("hil_mode")](options)
@@ -244,7 +276,7 @@ def _properties(result: dict[str, Any]) -> list[tuple[str, object]]:
 
 def _leave(item: pytest.Item, bench: "Bench", number: int) -> Path:
     """Write a bench's folder and return it."""
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in item.name)
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in f"{item.path.stem}.{item.name}")
     folder: Path = item.config.getoption("hil_out") / (f"{name}-{number + 1}" if number else name)
     bench.write(folder, item.name)
     return folder
@@ -259,4 +291,5 @@ def _replay_command(item: pytest.Item) -> str:
         if value is not None and any(str(argument).startswith(f"--{option}") for argument in given):
             options.append(f"--{option}={value}")
     path = os.path.relpath(item.path, item.config.invocation_params.dir)
-    return shlex.join(["pytest", "::".join([path, *item.nodeid.split("::")[1:]]), *options])
+    test = "::".join([path, *item.nodeid.split("::")[1:]])
+    return shlex.join([sys.executable, "-m", "pytest", test, *options])

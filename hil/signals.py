@@ -9,9 +9,13 @@ from dbc.contract import Contract
 _MULTIPLEXOR_BITS = 8
 
 
+class NothingKnownError(ValueError):
+    """A figure was asked of a quantity of which no value is known."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Series:
-    """A quantity over time.
+    """A quantity over time; its figures raise `NothingKnownError` where there is nothing to take them from.
 
     Attributes
     ----------
@@ -28,25 +32,28 @@ class Series:
         return len(self.values)
 
     def __repr__(self) -> str:
-        return f"<{len(self)} values, last {self.last:.6g}, largest magnitude {self.max:.6g}>"
+        known = f"last {self.last:.6g}, largest magnitude {self.max:.6g}" if self.known.size else "none known"
+        return f"<{len(self)} values, {known}>"
+
+    @property
+    def known(self) -> np.ndarray:
+        """The values that are known."""
+        return self.values[np.isfinite(self.values)]
 
     @property
     def rms(self) -> float:
-        """Root of the mean square; NaN if nothing is known, which no comparison passes."""
-        known = self._known()
-        return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+        """Root of the mean square."""
+        return float(np.sqrt(np.mean(self._some() ** 2)))
 
     @property
     def max(self) -> float:
-        """Largest magnitude; NaN if nothing is known."""
-        known = self._known()
-        return float(np.abs(known).max()) if known.size else float("nan")
+        """Largest magnitude."""
+        return float(np.abs(self._some()).max())
 
     @property
     def last(self) -> float:
-        """Newest known value; NaN if nothing is known."""
-        known = self._known()
-        return float(known[-1]) if known.size else float("nan")
+        """Newest known value."""
+        return float(self._some()[-1])
 
     def between(self, begin_s: float, end_s: float = float("inf")) -> "Series":
         """Return the part from `begin_s` until before `end_s`."""
@@ -58,8 +65,11 @@ class Series:
         when = self.time_s[self.values == value]
         return float(when[0]) if when.size else float("nan")
 
-    def _known(self) -> np.ndarray:
-        return self.values[np.isfinite(self.values)]
+    def _some(self) -> np.ndarray:
+        known = self.known
+        if not known.size:
+            raise NothingKnownError(f"none of {len(self)} values is known: let the bench run on first")
+        return known
 
 
 def signal_of(traffic: np.ndarray, contract: Contract, name: str, start_ns: int = 0) -> Series:

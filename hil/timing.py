@@ -16,9 +16,9 @@ from dbc.contract import Contract
 from dbc.e2e import MAX_COUNTER
 from dbc.node import PERIOD_NS
 from firmware_py.node import EXECUTION_NS
-from hil.bus.wire_core import INTERMISSION_BITS
-from hil.bus.wire_time import traffic_bits
+from hil.bus.wire_time import INTERMISSION_BITS, traffic_bits
 from hil.scenario import TimingLimits
+from hil.signals import NothingKnownError
 
 RECORDED = "recorded"
 INFERRED = "inferred from the bus"
@@ -37,7 +37,7 @@ Evidence = tuple[tuple[Callable[[int], str], np.ndarray], ...]
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Figure:
-    """One figure of every control period.
+    """One figure of every control period; its percentiles raise `NothingKnownError` if there is none.
 
     Attributes
     ----------
@@ -54,11 +54,18 @@ class Figure:
     evidence: Evidence
 
     def __repr__(self) -> str:
+        if not self.known.size:
+            return f"<{len(self.values)} periods, none measured>"
         return f"<{len(self.values)} periods: p50 {self.p50:.1f}, p99 {self.p99:.1f}, max {self.max:.1f} µs>"
 
     @property
+    def known(self) -> np.ndarray:
+        """What could be measured, µs."""
+        return self.values[np.isfinite(self.values)]
+
+    @property
     def p50(self) -> float:
-        """Median, µs; NaN if nothing was measured, which no comparison passes."""
+        """Median, µs."""
         return self._percentile(50)
 
     @property
@@ -73,11 +80,12 @@ class Figure:
 
     def summary(self) -> dict[str, float | None]:
         """Return median, 99th percentile and maximum, µs; None if nothing was measured."""
-        return {name: _or_none(getattr(self, name)) for name in ("p50", "p99", "max")}
+        return {name: getattr(self, name) if self.known.size else None for name in ("p50", "p99", "max")}
 
     def _percentile(self, percent: float) -> float:
-        measured = self.values[np.isfinite(self.values)]
-        return float(np.percentile(measured, percent)) if measured.size else float("nan")
+        if not self.known.size:
+            raise NothingKnownError(f"nothing was measured in {len(self.values)} periods")
+        return float(np.percentile(self.known, percent))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -66,13 +66,19 @@ def hydraulic_mode(parameters: PlantParameters, position_m: float) -> HydraulicM
 def state_space_coefficients(parameters: PlantParameters, position_m: float) -> StateSpaceCoefficients:
     """k1, k2, k3 of eq. (8) with the crane's effective mass at `position_m`."""
     mass = effective_mass_kg(parameters, position_m)
-    stiffness_a, stiffness_b = oil_stiffness_n_per_m(parameters, position_m)
-    gain_a = stiffness_a * parameters.pump_a_displacement_m3_per_rad / parameters.piston_area_m2
-    gain_b = stiffness_b * parameters.pump_b_displacement_m3_per_rad / parameters.annulus_area_m2
+    return coefficients_of_stiffness(parameters, mass, *oil_stiffness_n_per_m(parameters, position_m))
+
+
+def coefficients_of_stiffness(
+    parameters: PlantParameters, mass_kg: float, stiffness_a_n_per_m: float, stiffness_b_n_per_m: float
+) -> StateSpaceCoefficients:
+    """k1, k2, k3 of eq. (8) with given stiffnesses A²β/V of the chambers."""
+    gain_a = stiffness_a_n_per_m * parameters.pump_a_displacement_m3_per_rad / parameters.piston_area_m2
+    gain_b = stiffness_b_n_per_m * parameters.pump_b_displacement_m3_per_rad / parameters.annulus_area_m2
     return StateSpaceCoefficients(
-        k1_per_s2=-(stiffness_a + stiffness_b) / mass,
-        k2_per_s=-parameters.damping_n_s_per_m / mass,
-        k3_m_per_rad_s2=parameters.volumetric_efficiency * (gain_a + gain_b) / mass,
+        k1_per_s2=-(stiffness_a_n_per_m + stiffness_b_n_per_m) / mass_kg,
+        k2_per_s=-parameters.damping_n_s_per_m / mass_kg,
+        k3_m_per_rad_s2=parameters.volumetric_efficiency * (gain_a + gain_b) / mass_kg,
     )
 
 

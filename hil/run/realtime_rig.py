@@ -11,6 +11,7 @@ from statistics import median
 from threading import Thread
 
 from dbc.node import PERIOD_NS
+from firmware_py.chosen_tuning import chosen_tuning
 from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock, Port
 from hil.run.listener import Listener
@@ -27,6 +28,7 @@ from hil.run.options import (
 from hil.run.realtime import RealtimeNode
 from hil.run.rig import Rig
 from hil.supervisor import BRING_UP_PERIODS, Supervisor
+from plant_sim.machine import Machine
 
 _POLL_S = 0.05
 _SHORTEST_WAIT_S, _LONGEST_WAIT_S = 0.001, 0.1
@@ -51,12 +53,17 @@ class RealtimeRig(Rig):
     can.CanInitializationError
         On entry, if the bus cannot be opened.
     BenchError
-        On entry, if a side does not come up.
+        If another machine or tuning is asked for than that of a side which is not started here; on entry, if
+        a side does not come up.
     """
 
     mode = "realtime"
 
     def __init__(self, options: RigOptions) -> None:
+        asked = {"plant": options.machine != Machine(), "controller": options.tuning != chosen_tuning()}
+        if foreign := [side for side, differs in asked.items() if differs and side not in options.started]:
+            what = {"plant": "--machine", "controller": "--calibration"}[foreign[0]]
+            raise BenchError(f"the {foreign[0]} is not started here: start it with {what} yourself")
         super().__init__(options)
         self._session: RealtimeSession | None = None
 

@@ -8,10 +8,12 @@ from dataclasses import replace
 from typing import Protocol, Self
 
 from dbc.contract import Contract
+from firmware_py.chosen_tuning import ChosenTuning
 from hil.bus.wire import Port, Wire
 from hil.run.options import Recording, RigOptions, RunOptions
 from hil.scenario import PERIOD_S
 from hil.supervisor import BRING_UP_PERIODS, Supervisor
+from plant_sim.machine import Machine
 
 PROGRESS_PERIODS = 100
 
@@ -134,15 +136,15 @@ def play(rig: Rig, options: RunOptions) -> Recording:
 
 
 class RigKeeper:
-    """Keeps a rig open for as long as its context lasts, and replaces one that is broken.
+    """Keeps a rig open for as long as its context lasts; replaces one that is broken, or not the one needed.
 
     Parameters
     ----------
     new_rig : callable
-        Returns a rig that has not been entered.
+        Returns a rig with a machine and a tuning that has not been entered.
     """
 
-    def __init__(self, new_rig: Callable[[], Rig]) -> None:
+    def __init__(self, new_rig: Callable[[Machine, ChosenTuning], Rig]) -> None:
         self._new_rig = new_rig
         self._open: Rig | None = None
 
@@ -152,13 +154,17 @@ class RigKeeper:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def rig(self) -> Rig:
-        """Return an open rig that can begin a session."""
-        if self._open is not None and self._open.broken:
+    def rig(self, machine: Machine, tuning: ChosenTuning) -> Rig:
+        """Return an open rig that can begin a session on a machine under a tuning."""
+        if self._open is not None and not self._fits(self._open, machine, tuning):
             self._close()
         if self._open is None:
-            self._open = self._new_rig().__enter__()
+            self._open = self._new_rig(machine, tuning).__enter__()
         return self._open
+
+    @staticmethod
+    def _fits(rig: Rig, machine: Machine, tuning: ChosenTuning) -> bool:
+        return not rig.broken and (rig.options.machine, rig.options.tuning) == (machine, tuning)
 
     def _close(self) -> None:
         if self._open is not None:

@@ -72,7 +72,8 @@ OPERATING_POINTS: dict[str, Linearisation] = {
 
 shut: both chambers closed and flows of η D, the paper's model. held: where a controller really holds the rod,
 the check valve of the rod side conducting, so that this side's oil is no spring. lowering: the same at
--0.1 m/s, where the load drives oil through pump A and its gain is (2 - η) D instead of η D.
+-0.1 m/s, where the load drives oil through pump A and its gain is (2 - η) D instead of η D; no machine gets
+to do that in the last millimetres before the stop.
 """
 
 

@@ -27,7 +27,7 @@ BOX_RUNS = ("sine", "sine_load", "lift_lower_load", "full_stroke")
 
 FAILED_RMS_MM = 2.0
 
-_RUNS_PER_TASK = 16
+_RUNS_PER_TASK = 8
 _PR_SET_PDEATHSIG = 1
 _CLUSTER_TIMEOUT_S = 10
 

@@ -12,11 +12,13 @@ import numpy as np
 from firmware_py.chosen_tuning import ChosenTuning
 from hil.report import BLUE, GREY, RED
 from hil.scenario import CONTROLLERS, Scenario
-from hil.study.box import Box
+from hil.study.box import WHOLE, Box
 from hil.study.runs import FAILED_RMS_MM, FIGURES, failed
 from plant_sim.machine import Machine
 
 CONFIDENCE = 0.95
+CORNERS, SAMPLES = "corners", "latin hypercube"
+"""Designs of a sweep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +37,7 @@ class Sweep:
         Control law, one of `hil.scenario.CONTROLLERS`.
     box : Box
     design : str
-        "latin hypercube" or "corners".
+        `CORNERS` or `SAMPLES`.
     seed : int or None
         Of the hypercube.
     machines : tuple of Machine
@@ -51,6 +53,11 @@ class Sweep:
     design: str
     seed: int | None
     machines: tuple[Machine, ...]
+
+    @property
+    def kind(self) -> str:
+        """What the machines are called."""
+        return self.design if self.design == CORNERS else "samples"
 
     @property
     def law(self) -> int:
@@ -82,7 +89,7 @@ class Sweep:
         fails = failed(figures[..., 0])
         worst = np.where(np.isfinite(figures), figures, np.inf).max(axis=1)
         ordered = np.argsort(-worst[:, 0], kind="stable").tolist()
-        sampled = self.design != "corners"
+        sampled = self.design != CORNERS
         block = self.tuning.calibration.to_bytes()
         return {
             "scenarios": list(self.names),
@@ -128,10 +135,14 @@ def _spread(values: np.ndarray, sampled: bool) -> dict[str, float | None]:
     from scipy.stats import quantile_test
 
     interval = quantile_test(values, p=0.5).confidence_interval(CONFIDENCE) if sampled else (np.nan, np.nan)
-    with np.errstate(invalid="ignore"):  # between infinities
-        median, p95 = np.quantile(values, (0.5, 0.95))
-    spread = {"median": median, "median_low": interval[0], "median_high": interval[1], "p95": p95}
-    return {name: _finite(value) for name, value in (spread | {"worst": values.max()}).items()}
+    spread = {
+        "median": np.median(values),
+        "median_low": interval[0],
+        "median_high": interval[1],
+        "p95": np.quantile(values, 0.95, method="higher"),  # no mean with an infinity
+        "worst": values.max(),
+    }
+    return {name: _finite(value) for name, value in spread.items()}
 
 
 def _finite(value: float) -> float | None:
@@ -154,6 +165,7 @@ def draw(path: Path, sweep: Sweep, figures: np.ndarray, summary: dict[str, Any])
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import MaxNLocator
 
     rms_mm = np.nan_to_num(figures[..., 0], nan=np.inf).max(axis=1)
     fails = failed(rms_mm)
@@ -169,7 +181,7 @@ def draw(path: Path, sweep: Sweep, figures: np.ndarray, summary: dict[str, Any])
     )
     picture.suptitle(
         f"{', '.join(sweep.names)} under {sweep.tuning.name} ({sweep.controller}): "
-        f"{summary['failures']} of {summary['samples']} {sweep.design} samples above {FAILED_RMS_MM:g} mm"
+        f"{summary['failures']} of {summary['samples']} {sweep.kind} above {FAILED_RMS_MM:g} mm"
     )
     for axis in axes.flat[len(sweep.box.ranges) :]:
         axis.remove()
@@ -180,6 +192,7 @@ def draw(path: Path, sweep: Sweep, figures: np.ndarray, summary: dict[str, Any])
         axis.axhline(FAILED_RMS_MM, color=GREY, lw=0.9, ls="--")
         axis.set_yscale("log")
         axis.set_xlabel(key)
+        axis.xaxis.set_major_locator(MaxNLocator(5, integer=key in WHOLE))
         axis.grid(alpha=0.3)
     for axis in axes[:, 0]:
         axis.set_ylabel("RMS error / mm")

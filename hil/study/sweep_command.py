@@ -34,8 +34,9 @@ def add_command(commands: Any) -> None:
     sweep = commands.add_parser(
         "sweep",
         help="play scenarios on many machines of a box",
-        usage="hil sweep SCENARIO... [options]   (names as in `hil list`, or .toml files)",
-        epilog="exit codes: 0 played, however many samples failed; 2 wrong input; 130 interrupted",
+        usage="hil sweep SCENARIO... [options]   (names as in `hil list`, or .toml)",
+        epilog="exit codes: 0 played, however many samples failed; 2 wrong input or no answer;\n"
+        "3 a process was lost; 130 interrupted",
         formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=40),
     )
     sweep.set_defaults(command=run_command)
@@ -103,7 +104,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 
 def _sweep_of(arguments: argparse.Namespace) -> "Sweep":
-    from hil.study.sweep import Sweep
+    from hil.study.sweep import CORNERS, SAMPLES, Sweep
 
     scenarios = tuple(load_scenario(name, arguments.duration) for name in arguments.scenarios)
     tuning, box = tuning_of(arguments), load_box(arguments.box)
@@ -122,7 +123,7 @@ def _sweep_of(arguments: argparse.Namespace) -> "Sweep":
         tuning=tuning,
         controller=arguments.controller or controller_of(tuning.calibration.law),
         box=box,
-        design="corners" if arguments.corners else "latin hypercube",
+        design=CORNERS if arguments.corners else SAMPLES,
         seed=None if arguments.corners else arguments.seed,
         machines=tuple(machines),
     )

@@ -10,9 +10,11 @@ import pytest
 from bench_runs import SAFETY_NET_S, alive, background, children, name_of, wait_until
 
 from dbc.contract import PACKAGED_DBC
+from firmware_py.__main__ import main as firmware_main
 from hil import cli
 from hil.bus import link
 from hil.scenario import ScenarioError, load_scenario
+from plant_sim.__main__ import main as plant_main
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
@@ -87,6 +89,13 @@ GOOD = 'title = "t"\nreference = "sine"\nduration_s = 1.0\n'
         (GOOD + "[limits.adrc]\nrms_mm = 1\n", "limits.adrc"),
         (GOOD + '[limits.adrc]\nrms_mm = "a"\nmax_mm = 1\n', "limits.adrc"),
         (GOOD + "[paper.adrc]\nrms_mm = 1\nmax_mm = []\n", "paper.adrc"),
+        (GOOD + "machine = 3\n", "machine must be a table"),
+        (GOOD + "[machine]\nmas = 1\n", "mine: machine: there is no 'mas', only mass, bulk_modulus"),
+        (
+            GOOD + "[machine]\nmass = 99\n",
+            "machine: mass is 99, must be a number from 0.1 to 10 times nominal",
+        ),
+        (GOOD + "[machine]\ndelay_periods = 1.5\n", "machine: delay_periods is 1.5, must be a whole number"),
     ],
 )
 def test_a_malformed_scenario_file(capsys, out, tmp_path, text, what):
@@ -104,6 +113,31 @@ def test_a_scenario_file_that_is_no_text(capsys, out, tmp_path):
 @pytest.mark.parametrize("duration", ["0", "-1", "nan", "inf", "1e9"])
 def test_a_duration_that_makes_no_sense(capsys, out, duration):
     assert "duration_s" in refused(capsys, "run", "sine", f"--duration={duration}", "--out", out)
+
+
+# machine and tuning
+
+MACHINE_AND_TUNING = [
+    (["--machine", "mass"], "machine: 'mass' is not of the form KEY=VALUE"),
+    (["--machine", "delay_periods=4"], "machine: delay_periods is 4.0, must be a whole number from 1 to 3"),
+    (["--tuning", "best"], "there is no tuning 'best': choose one of paper"),
+    (["--calibration", "none.bin"], "cannot read calibration file none.bin (No such file or directory)"),
+    (["--calibration", __file__], "test_bad_input.py: calibration: magic"),
+    (["--tuning", "paper", "--calibration", __file__], "exclude each other"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "what"), MACHINE_AND_TUNING)
+def test_a_machine_or_tuning_that_is_none(capsys, out, arguments, what):
+    assert what in refused(capsys, "run", "sine", *arguments, "--out", out)
+
+
+@pytest.mark.parametrize(("arguments", "what"), MACHINE_AND_TUNING)
+def test_a_single_side_refuses_it_too(capsys, arguments, what):
+    side = plant_main if arguments[0] == "--machine" else firmware_main
+    assert side(["-i", "hilbus", "-c", "none", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert what in line
 
 
 def test_scenario_errors_are_value_errors_for_those_who_use_the_library():
@@ -214,6 +248,11 @@ def test_a_bit_rate_that_classic_can_does_not_have(capsys, command, bit_rate):
 def test_an_interface_in_virtual_time(capsys, out):
     line = refused(capsys, "run", "sine", "-i", "socketcan", "-c", "vcan0", "--out", out)
     assert "--interface needs --mode realtime" in line
+
+
+def test_a_pace_in_virtual_time(capsys, out):
+    line = refused(capsys, "run", "sine", "--rt-ratio", "0.1", "--out", out)
+    assert "--rt-ratio needs --mode realtime" in line
 
 
 def test_an_interface_without_a_channel(capsys, out):

@@ -13,12 +13,15 @@ import pytest
 from bench_runs import SAFETY_NET_S, busy_machine, hil, sha256, short_scenario
 
 from dbc.contract import Contract
+from firmware_py.chosen_tuning import chosen_tuning
+from firmware_py.tuning import TUNINGS
 from hil.bus import link
 from hil.bus.link import LinkError
 from hil.run.inprocess import run_inprocess
 from hil.run.lockstep import run_lockstep
 from hil.run.options import INTERRUPTED, Recording, RunOptions
 from hil.scenario import Scenario
+from plant_sim.machine import Machine
 
 CONTRACT = Contract.load()
 SINE = short_scenario(1.0)
@@ -26,7 +29,7 @@ SINE_LOAD = short_scenario(1.0, load=((0.4, -2000.0), (0.7, 500.0)))
 
 
 def options(directory: Path, scenario: Scenario = SINE, **given) -> RunOptions:
-    return RunOptions(scenario, "adrc", record_directory=directory, **given)
+    return RunOptions(scenario, record_directory=directory, **{"controller": "adrc"} | given)
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +65,18 @@ def test_lockstep_gives_the_same_frames_as_one_process(tmp_path, scenario, hashe
         one, other = getattr(here, name), getattr(apart, name)
         assert one.keys() == other.keys()
         assert all(np.array_equal(one[column], other[column]) for column in one)
+
+
+def test_on_another_machine_under_another_calibration_too(tmp_path):
+    block = tmp_path / "mine.bin"
+    block.write_bytes(TUNINGS["pi_star"].calibration().to_bytes())
+    heavy = replace(SINE, duration_s=0.3, machine=Machine(mass=1.5, delay_periods=3, position_lsb_um=10))
+    given = options(tmp_path, heavy, controller="", tuning=chosen_tuning(file=block))
+    apart = run_lockstep(given)
+    assert sha256(apart) == sha256(run_inprocess(given))
+    assert (apart.controller["position_um"] % 10 == 0).all()
+    nominal = options(tmp_path, replace(heavy, machine=Machine()), controller="", tuning=given.tuning)
+    assert sha256(apart) != sha256(run_inprocess(nominal))
 
 
 def test_at_another_bit_rate_too(tmp_path):

@@ -15,7 +15,7 @@ from hil.bus.hilbus import HilBus
 from hil.bus.opening import bus_settings, open_bus
 from hil.bus.socketcan import OutlivesInterruptions
 from hil.run.node_processes import side_arguments
-from hil.run.options import RigOptions
+from hil.run.options import SIDES, RigOptions
 
 
 @pytest.fixture(autouse=True)
@@ -190,9 +190,10 @@ def test_a_run_without_an_interface_is_on_a_bus_of_its_own_whatever_is_configure
 @pytest.mark.parametrize(("bit_rate", "arguments"), [(None, []), (500_000, ["-b", "500000"])])
 def test_the_bench_hands_the_bit_rate_to_both_sides(tmp_path, bit_rate, arguments):
     options = RigOptions(record_directory=tmp_path)
-    words = side_arguments(options, bus_settings("pcan", "PCAN_USBBUS1", bit_rate))
-    assert words[:4] == ["-i", "pcan", "-c", "PCAN_USBBUS1"]
-    assert words[words.index("-b") :] == arguments if arguments else "-b" not in words
+    for side in SIDES:
+        words = side_arguments(side, options, bus_settings("pcan", "PCAN_USBBUS1", bit_rate))
+        assert words[words.index("-i") :][:4] == ["-i", "pcan", "-c", "PCAN_USBBUS1"]
+        assert words[words.index("-b") :] == arguments if arguments else "-b" not in words
 
 
 # an interface that is down for a while

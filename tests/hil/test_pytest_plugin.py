@@ -53,6 +53,33 @@ def test_without_a_bench():
     pass
 """
 
+ON_OTHER_MACHINES = """
+import pytest
+
+HEAVY = {"mass": 1.5, "delay_periods": 3, "position_lsb_um": 10}
+
+@pytest.mark.bench(machine=HEAVY, tuning="pi_star")
+def test_as_marked(bench):
+    result = bench.result("")
+    assert (result["controller"], result["tuning"]) == ("pi", "pi_star")
+    assert result["machine"].items() >= HEAVY.items()
+
+def test_nominal(bench):
+    assert bench.result("")["machine"]["mass"] == 1.0
+
+def test_one_after_another(bench_at):
+    def rest_mm(machine):
+        bench = bench_at(position_m=0.2, machine=machine)
+        bench.run(0.05)
+        return bench.position_mm.last
+
+    assert rest_mm({}) == rest_mm({}) != rest_mm(HEAVY)
+
+@pytest.mark.bench(machine={"mass": 99})
+def test_too_heavy(bench):
+    pass
+"""
+
 LOSES_ITS_FIRMWARE = """
 import os, signal
 from pathlib import Path
@@ -140,26 +167,26 @@ def test_the_session_ends_as_its_tests_did(session):
 
 
 def test_a_failing_test_leaves_its_folder_and_says_where(session):
-    folder = session.folder / "out/pytest/test_fails"
+    folder = session.folder / "out/pytest/test_user.test_fails"
     assert {file.name for file in folder.iterdir()} == {
         "result.json",
         "trace.csv",
         "bus.log",
         "picture.png",
     }
-    assert "results in out/pytest/test_fails" in session.lines
-    assert [entry.name for entry in folder.parent.iterdir()] == ["test_fails"]
+    assert "results in out/pytest/test_user.test_fails" in session.lines
+    assert [entry.name for entry in folder.parent.iterdir()] == ["test_user.test_fails"]
 
 
 def test_the_replay_command_replays_the_run_to_the_last_bit(session, tmp_path):
     command = next(line for line in session.lines if line.startswith("replay: "))
-    program, *arguments = shlex.split(command.removeprefix("replay: "))
-    assert program == "pytest"
-    result = session.folder / "out/pytest/test_fails/result.json"
+    program, module, pytest_, *arguments = shlex.split(command.removeprefix("replay: "))
+    assert (program, module, pytest_) == (sys.executable, "-m", "pytest")
+    result = session.folder / "out/pytest/test_user.test_fails/result.json"
     again = run_pytest(session.folder, *arguments, f"--hil-out={tmp_path}")
     assert again.code == 1
     sha256 = json.loads(result.read_text())["bus_sha256"]
-    assert json.loads((tmp_path / "test_fails/result.json").read_text())["bus_sha256"] == sha256
+    assert json.loads((tmp_path / "test_user.test_fails/result.json").read_text())["bus_sha256"] == sha256
 
 
 def test_the_replay_command_holds_where_pytest_was_started(session, tmp_path):
@@ -170,14 +197,13 @@ def test_the_replay_command_holds_where_pytest_was_started(session, tmp_path):
         f"{session.folder.name}/test_user.py::test_fails",
         cwd=session.folder.parent,
     )
-    assert (
-        f"replay: pytest {session.folder.name}/test_user.py::test_fails --hil-mode=inprocess" in again.lines
-    )
+    test = f"{session.folder.name}/test_user.py::test_fails"
+    assert f"replay: {sys.executable} -m pytest {test} --hil-mode=inprocess" in again.lines
 
 
 def test_figures_go_into_the_junit_file(session):
     figures = dict(session.properties()["test_user.test_fails"])
-    result = json.loads((session.folder / "out/pytest/test_fails/result.json").read_text())
+    result = json.loads((session.folder / "out/pytest/test_user.test_fails/result.json").read_text())
     assert figures["bench"] == "inprocess"
     assert float(figures["rms_mm"]) == result["rms_mm"]
     assert float(figures["latency_us_p99"]) == result["timing"]["latency_us"]["p99"]
@@ -201,6 +227,7 @@ def test_only_what_was_selected_is_counted(tmp_path):
     ("arguments", "said"),
     [
         (["--hil-interface=hilbus"], "--hil-interface needs --hil-mode realtime"),
+        (["--rt-ratio=0.1"], "--rt-ratio needs --hil-mode realtime"),
         (["--hil-mode=realtime", "--rt-ratio=0"], "--rt-ratio: "),
         (["--hil-mode=realtime", "--rt-ratio=fast"], "--rt-ratio: "),
         (["--hil-mode=fast"], "argument --hil-mode: invalid choice: 'fast'"),
@@ -216,7 +243,31 @@ def test_a_wrong_option_is_refused_with_one_line(tmp_path, arguments, said):
 def test_a_need_that_nothing_has_is_refused(tmp_path):
     refused = user_session(tmp_path, USER_TESTS.replace("wire_faults", "wirefaults"), "--hil-mode=inprocess")
     assert refused.code == 4
-    assert "ERROR: test_user.py::test_spoils_the_wire: nothing has 'wirefaults'" in refused.lines
+    choose = "choose from machine, power, real_bus, tuning, virtual_time, wall_time, wire_faults"
+    assert f"ERROR: test_user.py::test_spoils_the_wire: nothing has 'wirefaults': {choose}" in refused.lines
+
+
+def test_a_beginning_that_a_bench_does_not_have_is_named(tmp_path):
+    mistyped = USER_TESTS.replace('controller="pi"', 'control="pi"')
+    session = user_session(tmp_path, mistyped, "--hil-mode=inprocess", "-k", "begins_as_marked")
+    assert (
+        "a bench takes no 'control': choose from controller, position_m, bit_rate, machine, tuning"
+        in session.said
+    )
+    assert "TypeError" not in session.said
+
+
+@pytest.mark.parametrize("mode", ["inprocess", "lockstep"])
+def test_a_test_chooses_machine_and_tuning(tmp_path, mode):
+    session = user_session(tmp_path, ON_OTHER_MACHINES, f"--hil-mode={mode}")
+    assert "3 passed, 1 error" in session.said
+    assert "machine: mass is 99, must be a number from 0.1 to 10 times nominal" in session.said
+
+
+def test_a_test_that_chooses_is_not_applicable_to_sides_that_others_start(tmp_path):
+    other = ["--hil-mode=realtime", "--hil-interface=hilbus", "--hil-channel=none", "--collect-only"]
+    collected = user_session(tmp_path, ON_OTHER_MACHINES, *other)
+    assert "hil: 2 scenarios on hilbus, 0 passed; 2 not applicable (2 need machine)" in collected.lines
 
 
 def test_a_lost_process_fails_its_test_only(tmp_path):

@@ -259,7 +259,9 @@ def test_the_list_names_every_scenario(capsys):
 
 
 @pytest.mark.parametrize(
-    "command", [["--help"], ["run", "--help"], ["bus", "--help"], ["list", "--help"]], ids=" ".join
+    "command",
+    [["--help"], ["run", "--help"], ["sweep", "--help"], ["bus", "--help"], ["list", "--help"]],
+    ids=" ".join,
 )
 def test_help_fits_a_screen(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")

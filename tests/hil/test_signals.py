@@ -14,7 +14,7 @@ from dbc.contract import Contract
 from dbc.frame import EFF_FLAG
 from hil.run.inprocess import run_inprocess
 from hil.run.options import Recording, RunOptions
-from hil.signals import Series, signal_of
+from hil.signals import NothingKnownError, Series, signal_of
 
 CONTRACT = Contract.load()
 DATABASE = cantools.database.load_file(Path(dbc.__file__).parent / "ddh.dbc")
@@ -83,8 +83,11 @@ def test_a_series_leaves_out_what_is_unknown():
     assert series.between(0.1, 0.2).values.tolist() == [-4.0]
 
 
-def test_no_comparison_passes_on_a_series_without_values():
-    nothing = Series(np.array([0.0]), np.array([np.nan]))
-    for figure in (nothing.max, nothing.rms, nothing.last, nothing.first(0.0)):
-        assert not figure < 1.0
-        assert not figure >= 1.0
+@pytest.mark.parametrize("figure", ["max", "rms", "last"])
+@pytest.mark.parametrize("values", [[], [np.nan]])
+def test_a_series_without_values_has_no_figures(figure, values):
+    nothing = Series(np.zeros(len(values)), np.array(values))
+    with pytest.raises(NothingKnownError, match=f"none of {len(values)} values is known"):
+        getattr(nothing, figure)
+    assert "none known" in repr(nothing)
+    assert np.isnan(nothing.first(0.0))

@@ -264,3 +264,28 @@ def test_after_a_reset_the_drive_can_be_enabled_again():
         speed = drive.step((controlword, 400))
     assert drive.state == ENABLED
     assert speed == pytest.approx(100.0 * math.pi / 30.0)
+
+
+# commands that wait
+
+
+def history(delay_periods, commands):
+    drive = Drive(delay_periods=delay_periods)
+    return [(drive.step(command), drive.state, drive.statusword) for command in commands]
+
+
+@pytest.mark.parametrize("delay_periods", [2, 3])
+def test_a_drive_with_more_delay_does_the_same_one_or_two_cycles_later(delay_periods):
+    """Power-up, motion, lost commands up to the fault, and a reset: all of it."""
+    moving = [(ENABLE, 400 * k) for k in range(1, 10)]
+    commands = [(SHUTDOWN, 0), (SWITCH_ON, 0), *moving, None, (ENABLE, -600), *[None] * 9, (RESET, 0), None]
+    later = delay_periods - 1
+    prompt = history(1, [*[None] * later, *commands])
+    assert history(delay_periods, [*commands, *[None] * later]) == prompt
+    assert {state for _, state, _ in prompt} >= {ENABLED, REACTING, FAULT}
+
+
+@pytest.mark.parametrize("delay_periods", [0, 4])
+def test_other_delays_are_refused(delay_periods):
+    with pytest.raises(ValueError, match=f"delay_periods is {delay_periods}, must be from 1 to 3"):
+        Drive(delay_periods=delay_periods)

@@ -28,8 +28,8 @@ RAD_S_PER_COUNT = math.pi / 30 / COUNTS_PER_RPM
 class Rig:
     """A plant and the one who commands it, one call per period."""
 
-    def __init__(self, sensor: PositionSensor | None = None) -> None:
-        self.plant = Plant(CONTRACT, PARAMETERS, sensor)
+    def __init__(self, sensor: PositionSensor | None = None, delay_periods: int = 1) -> None:
+        self.plant = Plant(CONTRACT, PARAMETERS, sensor, delay_periods)
         self.now_ns = 0
         self.sent: list[tuple[int, Frame]] = []
         self._protect = CONTRACT.drive_command.protector().protect
@@ -148,6 +148,27 @@ def test_a_command_is_latched_at_the_next_period_and_held_for_one(enabled):
     after = enabled.period(0)
     assert after["motor_speed_rad_s"] > 0.0
     assert after["speed_command_rad_s"] == 0.0
+
+
+@pytest.mark.parametrize("delay_periods", [1, 2, 3])
+def test_a_drive_with_more_delay_latches_one_or_two_periods_later(delay_periods):
+    rig = Rig(delay_periods=delay_periods)
+    rig.bench_reset(0.15)
+    for controlword in (SHUTDOWN, SHUTDOWN, SWITCH_ON, ENABLE):
+        rig.period(0, controlword)
+    commands = [100, 200, 300, 400, 500, 600]
+    taken = [round(rig.period(counts)["speed_command_rad_s"] / RAD_S_PER_COUNT) for counts in commands]
+    later = delay_periods - 1
+    assert taken == [0] * later + commands[: len(commands) - later]
+
+
+def test_a_reset_forgets_the_commands_that_wait():
+    rig = Rig(delay_periods=3)
+    for _ in range(3):
+        rig.period(0, SHUTDOWN)
+    rig.bench_reset(0.15)
+    states = [rig.period(0, SHUTDOWN)["drive_state"] for _ in range(3)]
+    assert states == [State.SWITCH_ON_DISABLED] * 2 + [State.READY_TO_SWITCH_ON]
 
 
 def test_of_two_commands_in_a_period_the_newest_counts(enabled):

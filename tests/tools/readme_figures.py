@@ -1,46 +1,55 @@
-"""The figures in README: tracking from runs over the bus (``make figures``), speed from ``make bench``."""
+"""The figures in README: tracking from ``hil reproduce`` (``make figures``), speed from ``make bench``."""
 
 import argparse
 import json
+import shutil
 import sys
-import tempfile
 from pathlib import Path
+from typing import Any
 
-from dbc.contract import Contract
-from hil.measure import result_of, trace_of
-from hil.report import draw
-from hil.run.inprocess import run_inprocess
-from hil.run.options import RunOptions
-from hil.scenario import load_scenario
+from hil import cli
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-PICTURE = ROOT / "docs" / "sine.png"
+TABLES = ROOT / "docs" / "tables.json"
+PICTURE = ROOT / "docs" / "figure_6.png"
 BENCH = ROOT / "docs" / "bench.json"
-SCENARIOS = ("sine", "sine_load", "lift_lower", "lift_lower_load")
-CONTROLLERS = ("p", "pi", "adrc")
+CHATTER = "chatter_rpm_per_period"
 
 
-def table(picture: Path | None = None) -> str:
-    """Return the figures as a Markdown table; draw the sine under ADRC to `picture`."""
-    contract = Contract.load()
-    lines = [
-        "| scenario | controller | this project, RMS / max mm | paper, RMS / max mm |",
-        "|---|---|---|---|",
-    ]
-    for name in SCENARIOS:
-        scenario = load_scenario(name)
-        for controller in CONTROLLERS:
-            with tempfile.TemporaryDirectory() as directory:
-                options = RunOptions(scenario, controller, record_directory=Path(directory))
-                recording = run_inprocess(options)
-            trace = trace_of(recording, contract)
-            result = result_of(recording, trace, contract, options, "inprocess")
-            ours, paper = (f"{f['rms_mm']:.3f} / {f['max_mm']:.3f}" for f in (result, result["paper"]))
-            lines.append(f"| {name} | {controller.upper()} | {ours} | {paper} |")
-            if picture is not None and (name, controller) == ("sine", "adrc"):
-                draw(picture, result, trace)
-    return "\n".join(lines) + "\n"
+def table() -> str:
+    """Return the errors in ``docs/tables.json`` as a Markdown table, the best of each row in bold."""
+    tables = json.loads(TABLES.read_text(encoding="utf-8"))
+    contestants, scenarios = tables["contestants"], tables["scenarios"]
+    heads = [label + " †" * bool(one["fitted"]) for label, one in contestants.items()]
+    rows = [["RMS / maximum error, mm", *heads], ["---"] * (len(heads) + 1)]
+    for name, scenario in scenarios.items():
+        papers = {one["law"]: label for label, one in contestants.items() if one["in_paper"]}
+        theirs = {papers[law]: figures for law, figures in scenario["paper"].items()}
+        rows.append([f"{name}, paper", *(_errors(theirs.get(label), {}) for label in contestants)])
+        best = {metric: set(labels) for metric, labels in scenario["best"].items()}
+        rows.append(
+            [
+                name,
+                *(
+                    _errors(figures, {metric for metric, labels in best.items() if label in labels})
+                    for label, figures in scenario["ours"].items()
+                ),
+            ]
+        )
+    chatter = {label: figures[CHATTER] for label, figures in scenarios["sine"]["ours"].items()}
+    rows.append(["speed chatter on the sine, rpm per ms", *(f"{value:.1f}" for value in chatter.values())])
+    robustness = tables["robustness"]
+    failures = [one["failures"] for one in robustness["contestants"].values()]
+    rows.append([f"failures of {robustness['samples']} other machines", *map(str, failures)])
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _errors(figures: dict[str, Any] | None, bold: set[str]) -> str:
+    if figures is None:
+        return ""
+    texts = {metric: f"{figures[metric]:.3f}" for metric in ("rms_mm", "max_mm")}
+    return " / ".join(f"**{text}**" if metric in bold else text for metric, text in texts.items())
 
 
 SPEED_ROWS = (  # figure of bench.json, what it is, unit, format
@@ -93,13 +102,18 @@ def _marks(block: str) -> tuple[str, str]:
 
 
 def main() -> int:
-    """Print the table, or write it and the picture into the project."""
-    parser = argparse.ArgumentParser(description="Run all scenarios and print README's table of figures.")
-    parser.add_argument("--write", action="store_true", help="rewrite README.md and docs/sine.png")
+    """Print the table, or evaluate anew and write it, its figures and the picture into the project."""
+    parser = argparse.ArgumentParser(description="Print README's table of figures.")
+    parser.add_argument("--write", action="store_true", help="evaluate; rewrite README.md and docs/")
     if not parser.parse_args().write:
         print(table(), end="")
         return 0
-    write_to_readme("figures", table(PICTURE))
+    out = ROOT / "out" / "reproduce"
+    if code := cli.main(["reproduce", "--out", str(out)]):
+        return code
+    for file in (TABLES, PICTURE):
+        shutil.copy(out / file.name, file)
+    write_to_readme("figures", table())
     return 0
 
 

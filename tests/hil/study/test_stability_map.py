@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import TUNINGS, Tuning
-from hil.closed_loop import run_closed_loop
 from hil.study.box import load_box
 from hil.study.linear import OPERATING_POINTS, analyse
 from hil.study.stability import POSITIONS_M, describe, heat_map, map_machines, stability_maps
@@ -41,23 +40,13 @@ def test_machines_that_differ_in_nothing_linear_share_their_loop():
     assert np.ptp(one.loop.spectral_radius) == 0.0
 
 
-def test_the_papers_tuning_is_unstable_at_many_corners_of_the_box():
-    """As its failures in runs say: 129 of 256 corners by the design's own count."""
+@pytest.mark.parametrize(("point", "unstable"), [("shut", 64), ("held", 152)])
+def test_the_papers_tuning_is_unstable_at_many_corners_of_the_box(point, unstable):
+    """In runs it fails at 129 of the 256, by the design's own count."""
     corners = load_box().corners()
     assert len(corners) == 256
-    unstable = stability_maps(PAPER, corners)["ADRC"].summary()["unstable_machines"]
-    assert 100 < unstable < 200
-
-
-def test_where_the_loop_with_soft_oil_is_unstable_the_kernel_cycles():
-    """At 200 mm with three tenths of the oil's stiffness, and not with the nominal one."""
-    setpoint = np.full(2000, 2_000_000, np.int32)
-    for machine in (Machine(), Machine(bulk_modulus=0.3, mass=1.5)):
-        run = run_closed_loop(
-            Tuning().calibration(), setpoint, np.zeros(2000), hold_periods=6000, parameters=machine.parameters
-        )
-        stable = bool(analyse(Tuning(), 0.2, machine=machine).stable)
-        assert (np.ptp(run.position_m) < 5e-6) == stable
+    summary = stability_maps(PAPER, corners, point=point)["ADRC"].summary()
+    assert summary["unstable_machines"] == pytest.approx(unstable, abs=4)
 
 
 def test_the_summary_names_the_worst_machine_and_position():

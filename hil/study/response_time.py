@@ -1,0 +1,139 @@
+"""Worst-case response times of CAN messages.
+
+R. Davis, A. Burns, R. Bril, J. Lukkien: "Controller Area Network (CAN) schedulability analysis: refuted,
+revisited and revised", Real-Time Systems 35 (2007), section 3: the earlier analysis of 1994 is optimistic
+where a message's busy period spans several of its instances.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+
+from hil.bus.wire_core import arbitration_key
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """A message that is sent again and again.
+
+    Attributes
+    ----------
+    name : str
+        For tables.
+    can_id : int
+        Identifier, `dbc.frame.EFF_FLAG` set for a 29-bit one; the priority.
+    bits : int
+        Longest frame, stuff bits and intermission included.
+    period_ns : int
+        Shortest time between two instances.
+    jitter_ns : int
+        Longest time from an instance's event to its frame being ready to send.
+    deadline_ns : int or None
+        Latest end of the frame after the event; None means the period.
+    """
+
+    name: str
+    can_id: int
+    bits: int
+    period_ns: int
+    jitter_ns: int = 0
+    deadline_ns: int | None = None
+
+    @property
+    def due_ns(self) -> int:
+        """The deadline that counts."""
+        return self.period_ns if self.deadline_ns is None else self.deadline_ns
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseTime:
+    """What the analysis says of a message.
+
+    Attributes
+    ----------
+    traffic : Traffic
+        The message.
+    duration_ns : int
+        Longest frame at the bit rate.
+    blocking_ns : int
+        Longest frame of lower priority that may have just begun.
+    worst_ns : int or None
+        Longest time from the event to the end of the frame's intermission; None if there is no bound.
+    instances : int
+        Instances in the busy period, each of which may be the worst.
+    """
+
+    traffic: Traffic
+    duration_ns: int
+    blocking_ns: int
+    worst_ns: int | None
+    instances: int
+
+    @property
+    def met(self) -> bool:
+        """Whether every instance meets its deadline."""
+        return self.worst_ns is not None and self.worst_ns <= self.traffic.due_ns
+
+
+def load(messages: Iterable[Traffic], bit_rate: int) -> Fraction:
+    """Return the share of bus time that the messages take at most."""
+    return sum((Fraction(m.bits * NS_PER_S, m.period_ns * bit_rate) for m in messages), Fraction(0))
+
+
+def response_times(messages: Iterable[Traffic], bit_rate: int) -> list[ResponseTime]:
+    """Return the worst case of each message, in order of priority.
+
+    Parameters
+    ----------
+    messages : iterable of Traffic
+        All that is sent on the bus.
+    bit_rate : int
+        Bit/s.
+
+    Raises
+    ------
+    ValueError
+        If two messages have one identifier, or a period is not positive.
+    """
+    ordered = sorted(messages, key=lambda message: int(arbitration_key(message.can_id)))
+    for message, following in pairwise(ordered):
+        if message.can_id == following.can_id:
+            raise ValueError(f"{message.name} and {following.name} have one identifier {message.can_id:#x}")
+    if slow := [message.name for message in ordered if message.period_ns <= 0]:
+        raise ValueError(f"{slow[0]} has no period: without one there is no bound on anything below it")
+    return [_worst_case(ordered, rank, bit_rate) for rank in range(len(ordered))]
+
+
+def _worst_case(ordered: Sequence[Traffic], rank: int, bit_rate: int) -> ResponseTime:
+    durations = [-(-message.bits * NS_PER_S // bit_rate) for message in ordered]
+    bit_ns = -(-NS_PER_S // bit_rate)
+    this, duration_ns = ordered[rank], durations[rank]
+    higher = list(zip(ordered[:rank], durations, strict=False))
+    blocking_ns = max(durations[rank + 1 :], default=0)
+    if load(ordered[: rank + 1], bit_rate) >= 1:
+        return ResponseTime(this, duration_ns, blocking_ns, None, 0)
+
+    def interference_ns(over_ns: int, competing: Iterable[tuple[Traffic, int]]) -> int:
+        return sum(-(-(over_ns + k.jitter_ns) // k.period_ns) * cost_ns for k, cost_ns in competing)
+
+    busy_ns, before_ns = duration_ns, 0
+    while busy_ns != before_ns:
+        before_ns = busy_ns
+        busy_ns = blocking_ns + interference_ns(before_ns, [*higher, (this, duration_ns)])
+    instances = -(-(busy_ns + this.jitter_ns) // this.period_ns)
+
+    worst_ns = 0
+    waiting_ns = blocking_ns
+    for instance in range(instances):
+        before_ns = -1
+        while waiting_ns != before_ns:
+            before_ns = waiting_ns
+            queued_ns = interference_ns(before_ns + bit_ns, higher)
+            waiting_ns = blocking_ns + instance * duration_ns + queued_ns
+        response_ns = this.jitter_ns + waiting_ns - instance * this.period_ns + duration_ns
+        worst_ns = max(worst_ns, response_ns)
+        waiting_ns += duration_ns
+    return ResponseTime(this, duration_ns, blocking_ns, worst_ns, instances)

@@ -1,0 +1,132 @@
+"""``hil rta``: worst-case response times of the messages of a DBC file."""
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from dbc.contract import PACKAGED_DBC, ContractError
+from dbc.frame import EFF_FLAG
+from hil.bus.wire_time import worst_case_bits
+from hil.run.options import DEFAULT_BIT_RATE, check_bit_rate
+from hil.study.response_time import ResponseTime, Traffic, load, response_times
+
+EXIT_OK, EXIT_MISSED = range(2)
+_NS_PER_MS = 1_000_000
+_MAX_CLASSIC_DLC = 8
+
+
+def add_command(commands: Any) -> None:
+    """Add ``rta`` to the bench's commands."""
+    parser = commands.add_parser(
+        "rta",
+        help="worst-case response time of every message of the DBC",
+        description="Worst-case response times (Davis et al. 2007) of the cyclic messages of a DBC. "
+        "Each node sends its frames by priority; a message with a cycle time is taken to come no oftener.",
+        epilog="exit codes: 0 every message meets its deadline at every bit rate asked for; 1 one does not; "
+        "2 wrong input",
+    )
+    parser.set_defaults(command=_rta)
+    parser.add_argument("--dbc", type=Path, default=PACKAGED_DBC, metavar="FILE", help="default: ours")
+    parser.add_argument(
+        "-b",
+        "--bitrate",
+        type=int,
+        action="append",
+        metavar="B",
+        help="bit/s (default the DBC's Baudrate); may be repeated",
+    )
+    parser.add_argument(
+        "--jitter", type=float, default=0.0, metavar="US", help="queuing jitter of every message, µs"
+    )
+    parser.add_argument("--json", action="store_true", help="print figures instead of tables")
+
+
+def cyclic_traffic(dbc: Path, jitter_ns: int = 0) -> tuple[list[Traffic], list[str], int]:
+    """Return the cyclic messages of a DBC, the names of those left out, and its bit rate.
+
+    Left out is what has no ``GenMsgCycleTime`` and what belongs to the bench channel.
+
+    Raises
+    ------
+    ContractError
+        If the file is unreadable, has no cyclic message, or one that is no classic CAN frame.
+    """
+    from cantools.database import Database, load_file
+    from cantools.database.errors import Error
+
+    try:
+        database = load_file(dbc, database_format="dbc")
+    except (OSError, UnicodeDecodeError, Error) as error:
+        reason = " ".join(str(error).split())
+        raise ContractError(f"{dbc}: cannot be read ({reason}): check the path and the file") from error
+    assert isinstance(database, Database)
+    traffic, left_out = [], []
+    for message in database.messages:
+        attributes = message.dbc.attributes if message.dbc else {}
+        bench_channel = "BenchChannel" in attributes and attributes["BenchChannel"].value
+        if not message.cycle_time or bench_channel:
+            left_out.append(message.name)
+            continue
+        if message.is_fd or message.length > _MAX_CLASSIC_DLC:
+            raise ContractError(f"{dbc}: {message.name} is no classic CAN frame: the analysis is for those")
+        can_id = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
+        bits = worst_case_bits(can_id, message.length)
+        traffic.append(Traffic(message.name, can_id, bits, message.cycle_time * _NS_PER_MS, jitter_ns))
+    if not traffic:
+        raise ContractError(
+            f"{dbc}: no message has a cycle time (GenMsgCycleTime): there is nothing to bound"
+        )
+    baudrate = database.dbc.attributes.get("Baudrate") if database.dbc else None
+    return traffic, left_out, int(baudrate.value) if baudrate else DEFAULT_BIT_RATE
+
+
+def _rta(arguments: argparse.Namespace) -> int:
+    if not 0.0 <= arguments.jitter < 1e6:
+        raise ContractError(f"--jitter is {arguments.jitter}, must be from 0 to 1e6 µs")
+    for bit_rate in arguments.bitrate or ():
+        check_bit_rate(bit_rate)
+    traffic, left_out, nominal = cyclic_traffic(arguments.dbc, round(arguments.jitter * 1e3))
+    bit_rates = arguments.bitrate or [nominal]
+    results = {bit_rate: response_times(traffic, bit_rate) for bit_rate in bit_rates}
+    if arguments.json:
+        print(json.dumps({str(b): _figures(traffic, b, rows) for b, rows in results.items()}, indent=2))
+    else:
+        for bit_rate, rows in results.items():
+            Console().print(_table(traffic, bit_rate, rows))
+        if left_out:
+            print(f"left out (no cycle time, or bench channel): {', '.join(left_out)}")
+    return EXIT_OK if all(row.met for rows in results.values() for row in rows) else EXIT_MISSED
+
+
+def _figures(traffic: list[Traffic], bit_rate: int, rows: list[ResponseTime]) -> dict[str, Any]:
+    messages = []
+    for row in rows:
+        figures = asdict(row)
+        messages.append(
+            {**figures.pop("traffic"), **figures, "deadline_ns": row.traffic.due_ns, "met": row.met}
+        )
+    return {"load_percent": float(100 * load(traffic, bit_rate)), "messages": messages}
+
+
+def _table(traffic: list[Traffic], bit_rate: int, rows: list[ResponseTime]) -> Table:
+    share = float(100 * load(traffic, bit_rate))
+    table = Table(title=f"{bit_rate / 1e3:g} kbit/s, load at most {share:.1f} %; times in µs", box=None)
+    for heading in ("message", "id"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("period", "frame", "blocked", "worst", "deadline", ""):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        message = row.traffic
+        times_ns = message.period_ns, row.duration_ns, row.blocking_ns, row.worst_ns, message.due_ns
+        table.add_row(
+            message.name,
+            f"{message.can_id & ~EFF_FLAG:#x}",
+            *("no bound" if ns is None else f"{ns / 1e3:.0f}" for ns in times_ns),
+            "met" if row.met else "[red]missed[/red]",
+        )
+    return table
