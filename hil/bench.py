@@ -10,7 +10,7 @@ from dbc.contract import Contract
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
 from hil.bus.wire import ErrorState, FrameFault, Port, Wire
-from hil.measure import M_TO_MM, Trace, figures_of, setting_of, timing_in, trace_of
+from hil.measure import M_TO_MM, Trace, bus_load_of_windows, figures_of, setting_of, timing_in, trace_of
 from hil.report import OutputDirectory
 from hil.run.options import SIDES, BenchError, Recording
 from hil.run.rig import Rig
@@ -222,6 +222,10 @@ class Bench:
         if self._timing is None:
             self._timing = timing_in(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
         return self._timing
+
+    def bus_load_percent(self, window_s: float = 0.01) -> Series:
+        """Return the bus load of every window since time 0, %, the bench channel left out."""
+        return bus_load_of_windows(self.recording, self._contract, self.bit_rate, window_s)
 
     def check_timing(self, limits: TimingLimits) -> None:
         """Make sure that every control period met its limits.

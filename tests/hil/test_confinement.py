@@ -312,6 +312,24 @@ def test_a_few_destroyed_commands_are_repeated_within_their_period(bench):
     assert bench.error_state("controller").name == "error-active"
 
 
+def test_bus_load_by_window_shows_where_attempts_were_destroyed(bench):
+    bench.destroy("DriveCommand", bit=60, count=5)
+    bench.run(0.1)
+    load = bench.bus_load_percent(window_s=0.01)
+    assert len(load) == 60
+    struck = int(np.argmax(load.values))
+    assert load.time_s[struck] == pytest.approx(0.51)
+    same_messages = load.values[struck - 10]  # 100 ms before
+    more_bits = (load.values[struck] - same_messages) / 100 * 10_000
+    assert more_bits == pytest.approx(5 * (61 + ERROR_BITS + IFS_BITS), abs=25), "stuff bits differ"
+
+
+@pytest.mark.parametrize("window_s", [0.0, -1.0, float("nan")])
+def test_a_window_has_a_length(bench, window_s):
+    with pytest.raises(ValueError, match="a window is longer than nothing"):
+        bench.bus_load_percent(window_s)
+
+
 def test_a_controller_that_goes_bus_off_is_stopped_by_the_drive_and_recovers_when_reset(bench):
     bench.destroy("DriveCommand", count=32)
     bench.run(0.003)
