@@ -1,5 +1,7 @@
 """The built-in tuning `robust`: tracking, steps, holding still, and no failure anywhere in the box."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from kernel_runs import CASES, CheckedController, step_through
@@ -102,11 +104,23 @@ def test_a_coarse_sensor_moves_the_rod_by_little_while_it_is_held(position_mm):
 # the box of machines
 
 
+def with_speed_gain(rad_per_m):
+    """The tuning with one speed per rod speed in both directions."""
+    front_end = replace(ROBUST.front_end, extend_rad_per_m=rad_per_m, retract_rad_per_m=rad_per_m)
+    return replace(ROBUST, front_end=front_end)
+
+
 @pytest.mark.parametrize("point", OPERATING_POINTS)
 def test_the_linear_loop_is_stable_on_every_corner_over_the_whole_stroke(point):
+    """With the mean speed per rod speed, and with those of the directions in which the rod may move there."""
+    gains = ROBUST.front_end
+    tunings = {"mean": (ROBUST, None), "retracting": (with_speed_gain(gains.retract_rad_per_m), None)}
+    if point != "lowering":
+        tunings["extending"] = (with_speed_gain(gains.extend_rad_per_m), None)
     machines = [Machine(), *load_box().corners()]
-    summary = stability_maps({"robust": (ROBUST, None)}, machines, point=point)["robust"].summary()
-    assert summary["unstable_machines"] == 0, summary
+    for stability in stability_maps(tunings, machines, point=point).values():
+        summary = stability.summary()
+        assert summary["unstable_machines"] == 0, summary
 
 
 def assert_holds(machines):
