@@ -6,6 +6,10 @@ EFF_FLAG = 0x8000_0000
 """Set in `Frame.can_id` for a 29-bit identifier, as in SocketCAN's `can_id` word."""
 
 
+ERR_FLAG = 0x2000_0000
+"""Set in the id word of an error frame in a log, as in SocketCAN's."""
+
+
 class Frame(NamedTuple):
     """A classic CAN data frame.
 

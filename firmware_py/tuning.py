@@ -72,15 +72,15 @@ class FrontEndTuning:
 
     extend_rad_per_m: float = 1600.0
     retract_rad_per_m: float = 1350.0
-    lead_s: float = 8e-3
-    lead_filter_s: float = 4.5e-3
+    lead_s: float = 6e-3
+    lead_filter_s: float = 15e-3
 
 
 @dataclass(frozen=True, slots=True)
 class CommandFilterTuning:
     """Low-pass and slew limit on the way to the drive; a time constant of 0 makes no low-pass."""
 
-    time_constant_s: float = 2.96e-3
+    time_constant_s: float = 0.67e-3
     slew_rad_s2: float = 2000.0
 
 
@@ -89,14 +89,15 @@ class ScheduledTuning:
     """ADRC whose nominal model is scheduled on the position; every gain is fitted over the box of machines.
 
     The oil's stiffness over that at the reference position is
-    S(x) = (1 / (x + end_a) + ratio / (L - x + end_b)) / (the same at the reference): eqs 20 to 22 with the
-    areas' ratio 0.75, and with ends that are softer than the machine's (0.7 and 0.9 mm).
+    S(x) = (1 / (x + end_a) + weight / (L - x + end_b)) / (the same at the reference): the form of eqs 20 to
+    22, whose weight is the areas' ratio 0.75 and whose ends are 0.7 and 0.9 mm. The weight is less, because
+    where a controller holds the load the rod side's check valve conducts, and its oil is no spring.
     b0(x) = b0 S(x) and a1n(x) = -kappa b0(x) with the front end's kappa.
 
     Attributes
     ----------
     b0_m_s2_per_rad : float
-        Input gain at the reference position; far below the machine's 14, as for soft oil and a heavy load.
+        Input gain at the reference position; far below the machine's, as for soft oil and a heavy load.
     beta1_per_s, beta2_per_s2, beta3_per_s3 : float
         Observer gains of eq. 26.
     omega_d_rad_s : float
@@ -110,20 +111,20 @@ class ScheduledTuning:
         Of the motor in the observer's model.
     """
 
-    b0_m_s2_per_rad: float = 3.59
-    beta1_per_s: float = 366.0
-    beta2_per_s2: float = 61_280.0
-    beta3_per_s3: float = 2.109e6
-    omega_d_rad_s: float = 6.6
-    k1_rad_s_per_m: float = 12_046.0
-    k2_rad_per_m: float = -183.5
-    k3_rad_s2_per_m: float = 0.183
-    k3_soft_rad_s2_per_m: float = 1.75
-    motor_time_constant_s: float = 1.97e-3
+    b0_m_s2_per_rad: float = 2.277
+    beta1_per_s: float = 503.7
+    beta2_per_s2: float = 118_700.0
+    beta3_per_s3: float = 440_600.0
+    omega_d_rad_s: float = 12.04
+    k1_rad_s_per_m: float = 6000.0
+    k2_rad_per_m: float = -17.39
+    k3_rad_s2_per_m: float = 0.3702
+    k3_soft_rad_s2_per_m: float = 1.714
+    motor_time_constant_s: float = 0.39e-3
     stroke_m: float = 0.4
-    end_a_m: float = 0.0409
-    end_b_m: float = 0.0244
-    area_ratio: float = 0.75
+    end_a_m: float = 0.04495
+    end_b_m: float = 0.1833
+    rod_side_weight: float = 0.1949
     reference_m: float = 0.15
 
     def stiffness(self, position_m: float) -> float:
@@ -137,7 +138,7 @@ class ScheduledTuning:
 
     def _columns(self, position_m: float) -> float:
         column_b_m = self.stroke_m - position_m + self.end_b_m
-        return 1 / (position_m + self.end_a_m) + self.area_ratio / column_b_m
+        return 1 / (position_m + self.end_a_m) + self.rod_side_weight / column_b_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +328,7 @@ def _schedule(scheduled: ScheduledTuning) -> dict[int, int]:
         | _value(k.CAL_STIFFNESS_END_A, scheduled.end_a_m, POSITION_LSB)
         | _value(k.CAL_STIFFNESS_END_B, scheduled.end_b_m, POSITION_LSB)
         | _value(k.CAL_STIFFNESS_A, share_m, POSITION_LSB)
-        | _value(k.CAL_STIFFNESS_B, scheduled.area_ratio * share_m, POSITION_LSB)
+        | _value(k.CAL_STIFFNESS_B, scheduled.rod_side_weight * share_m, POSITION_LSB)
     )
 
 

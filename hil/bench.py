@@ -9,8 +9,8 @@ from dbc.codec import signal_name
 from dbc.contract import Contract
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
-from hil.bus.wire import FrameFault, Port, Wire
-from hil.measure import M_TO_MM, Trace, figures_of, setting_of, timing_in, trace_of
+from hil.bus.wire import ErrorState, FrameFault, Port, Wire
+from hil.measure import M_TO_MM, Trace, bus_load_of_windows, figures_of, setting_of, timing_in, trace_of
 from hil.report import OutputDirectory
 from hil.run.options import SIDES, BenchError, Recording
 from hil.run.rig import Rig
@@ -150,6 +150,20 @@ class Bench:
         """Let the next frames of a message carry the payload of the last one, counter and CRC included."""
         self._spoil(message, FrameFault.REPEAT, 0, count)
 
+    def destroy(self, message: str, bit: int = 20, count: int = 1) -> None:
+        """Hit the next attempts to send a message with a bad bit: error frames end them, others follow."""
+        if not 0 <= bit < 130:
+            raise ValueError(f"a frame has bits 0 to 129, not {bit}")
+        self._spoil(message, FrameFault.DESTROY, bit, count)
+
+    def disturb(self, bit_error_rate: float, duration_s: float, seed: int = 0) -> None:
+        """Let every bit on the wire be bad with a probability, for some time."""
+        self._wire("disturb").disturb(bit_error_rate, round(duration_s * 1e9), seed)
+
+    def error_state(self, node: str) -> ErrorState:
+        """Return error counters and state of the CAN controller of "plant" or "controller"."""
+        return self._wire("error_state").error_state(self._port(node))
+
     def power_off(self, node: str) -> None:
         """Cut "plant" or "controller" off."""
         self._wire("power_off").detach(self._port(node))
@@ -208,6 +222,10 @@ class Bench:
         if self._timing is None:
             self._timing = timing_in(self.recording, self.trace, self._contract, self.bit_rate, self.mode)
         return self._timing
+
+    def bus_load_percent(self, window_s: float = 0.01) -> Series:
+        """Return the bus load of every window since time 0, %, the bench channel left out."""
+        return bus_load_of_windows(self.recording, self._contract, self.bit_rate, window_s)
 
     def check_timing(self, limits: TimingLimits) -> None:
         """Make sure that every control period met its limits.

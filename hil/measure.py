@@ -212,10 +212,29 @@ def left_run(trace: Trace) -> str:
 
 def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) -> float:
     """Return the share of bus time that the frames take at `bit_rate`, the bench channel left out."""
+    _, bits = _carried(recording, contract)
+    return 100.0 * int(bits.sum()) / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
+
+
+def bus_load_of_windows(recording: Recording, contract: Contract, bit_rate: int, window_s: float) -> Series:
+    """Return the bus load in % of each whole window since the scenario began, at the windows' ends.
+
+    A frame counts in the window in which it ends, error frames with what they destroyed.
+    """
+    if not window_s > 0.0:
+        raise ValueError(f"a window is longer than nothing, not {window_s} s")
+    ends_ns, bits = _carried(recording, contract)
+    length_s = recording.simulated_s - recording.start_ns * 1e-9
+    edges_s = np.arange(int(length_s / window_s + 1e-9) + 1) * window_s
+    inside, _ = np.histogram((ends_ns - float(recording.start_ns)) * 1e-9, edges_s, weights=bits)
+    return Series(edges_s[1:], 100.0 * inside / bit_rate / window_s)
+
+
+def _carried(recording: Recording, contract: Contract) -> tuple[np.ndarray, np.ndarray]:
+    """Return ends (bus time, ns) and lengths (bits) of all frames but the bench channel's."""
     bench = {message.can_id for message in contract.messages if message.bench_channel}
     carried = recording.traffic[~np.isin(recording.traffic[:, 1], list(bench))]
-    bits = int(traffic_bits(carried).sum())
-    return 100.0 * bits / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
+    return carried[:, 0], traffic_bits(carried)
 
 
 def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: int, mode: str) -> Timing:

@@ -99,7 +99,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Deselect what needs what the interface lacks."""
     has = CAPABILITIES.get(interface_of(config), _OTHER_ADAPTER)
     has |= {OF_SIDES[side] for side in _started(config)}
-    known = {*OF_SIDES.values(), *(need for needs in CAPABILITIES.values() for need in needs)}
+    known = sorted({*OF_SIDES.values(), *(need for needs in CAPABILITIES.values() for need in needs)})
     lacking: Counter[str] = Counter()
     out = []
     for item in filter(_has_bench, items):
@@ -107,8 +107,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if begins := item.get_closest_marker("bench"):
             needs += [need for need in OF_SIDES.values() if need in begins.kwargs]
         if unknown := [need for need in needs if need not in known]:
-            choice = ", ".join(sorted(known))
-            raise pytest.UsageError(f"{item.nodeid}: nothing has {unknown[0]!r}: choose from {choice}")
+            raise pytest.UsageError(
+                f"{item.nodeid}: nothing has {unknown[0]!r}: choose from {', '.join(known)}"
+            )
         if missing := [need for need in needs if need not in has]:
             lacking[missing[0]] += 1
             out.append(item)

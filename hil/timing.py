@@ -16,8 +16,7 @@ from dbc.contract import Contract
 from dbc.e2e import MAX_COUNTER
 from dbc.node import PERIOD_NS
 from firmware_py.node import EXECUTION_NS
-from hil.bus.wire_core import INTERMISSION_BITS
-from hil.bus.wire_time import traffic_bits
+from hil.bus.wire_time import INTERMISSION_BITS, traffic_bits
 from hil.scenario import TimingLimits
 from hil.signals import NothingKnownError
 

@@ -1,4 +1,7 @@
-"""P and PI position control, and PI with velocity feed-forward; the integral part stops growing while the drive's speed limits the command."""
+"""P and PI position control, PI also with velocity feed-forward.
+
+The integral part stops growing while the drive's speed limits the command.
+"""
 
 from firmware_py.kernel.fixedpoint import gain, sat32, store
 from firmware_py.kernel.front_end import feed_forward, front_end_step

@@ -2,7 +2,7 @@
 
 from can import Message
 
-from dbc.frame import EFF_FLAG, Frame
+from dbc.frame import EFF_FLAG, ERR_FLAG, Frame
 
 
 def to_message(time_ns: int, frame: Frame, channel: str | None = None, is_rx: bool = True) -> Message:
@@ -10,7 +10,8 @@ def to_message(time_ns: int, frame: Frame, channel: str | None = None, is_rx: bo
     can_id, dlc, data = frame
     return Message(
         timestamp=time_ns / 1e9,
-        arbitration_id=can_id & ~EFF_FLAG,
+        arbitration_id=can_id & ~(EFF_FLAG | ERR_FLAG),
+        is_error_frame=bool(can_id & ERR_FLAG),
         is_extended_id=bool(can_id & EFF_FLAG),
         dlc=dlc,
         data=data.to_bytes(8, "little")[:dlc],

@@ -15,7 +15,7 @@ import numpy as np
 from dbc.frame import Frame
 from dbc.jit import entry_point
 from dbc.node import NOTHING, Node
-from hil.bus import link
+from hil.bus import confinement, link
 from hil.bus import wire_core as at
 from hil.bus.wire_core import NEVER, arbitration_key
 
@@ -56,12 +56,32 @@ class FrameFault(IntEnum):
         It is handed over later [ns].
     REPEAT
         It carries the payload of the last one before the fault.
+    DESTROY
+        It begins, and an error frame ends it; it is sent again [the bit that is hit, 0 being its start].
     """
 
     DROP = at.DROP
     CORRUPT = at.CORRUPT
     DELAY = at.DELAY
     REPEAT = at.REPEAT
+    DESTROY = at.DESTROY
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorState:
+    """A node's part in fault confinement: both counters, and what follows from them.
+
+    Attributes
+    ----------
+    name : str
+        "error-active", "error-passive" or "bus-off".
+    tec, rec : int
+        Transmit and receive error counter.
+    """
+
+    name: str
+    tec: int
+    rec: int
 
 
 class LocalNode:
@@ -163,7 +183,7 @@ class Wire:
         clock = clock or Clock()
         asked = node if isinstance(node, link.Askable) else LocalNode(node)
         port = Port(asked, order, clock, memoryview(self._mail[order]).cast("B"), asked.ask)
-        self._port_words[order] = NEVER, clock.phase_ns, clock.drift_ppb, 0, asked.link, 0
+        self._port_words[order, : confinement.TEC] = NEVER, clock.phase_ns, clock.drift_ppb, 0, asked.link, 0
         self._core[at.PORTS] += 1
         self._ports.append(port)
         self._set_filters()
@@ -183,8 +203,9 @@ class Wire:
         self._set_filters()
 
     def start(self, port: Port) -> None:
-        """Power a node on now."""
+        """Power a node on now; it has seen no error."""
         words = self._mail[port.order]
+        self._port_words[port.order, confinement.TEC :] = 0
         self._make_room()
         words[: at.FRAMES] = link.START, port.clock.local(self.now_ns)
         self._port_words[port.order, at.MAILED] = 0
@@ -203,7 +224,15 @@ class Wire:
         can_id, dlc, data = frame
         head = can_id | dlc << 32
         _hand_over(
-            self._core, self._queue, self._faults, self._out_of_band, sender, ready_ns, head, _signed(data)
+            self._core,
+            self._port_words,
+            self._queue,
+            self._faults,
+            self._out_of_band,
+            sender,
+            ready_ns,
+            head,
+            _signed(data),
         )
 
     def withdraw(self, sender: int) -> None:
@@ -232,6 +261,26 @@ class Wire:
             earlier = self.log[self.log[:, at.LOG_HEAD] & 0xFFFF_FFFF == can_id]
             argument = int(earlier[-1, at.LOG_DATA]) if len(earlier) else 0
         self._faults[free[0]] = can_id, fault, _signed(argument), count
+
+    def disturb(self, bit_error_rate: float, duration_ns: int, seed: int = 0) -> None:
+        """Let every bit be bad with a probability, from now on; each bad one destroys the frame it is in.
+
+        Raises
+        ------
+        ValueError
+            If the rate is not from 1e-9 to 0.5.
+        """
+        if not 1e-9 <= bit_error_rate <= 0.5:
+            raise ValueError(f"a bit error rate is from 1e-9 to 0.5, not {bit_error_rate}")
+        noise = self.now_ns + duration_ns, round(bit_error_rate * 1e9), seed
+        self._core[[at.NOISE_UNTIL, at.NOISE_LEVEL, at.NOISE_STATE]] = noise
+
+    def error_state(self, port: Port) -> ErrorState:
+        """Return what fault confinement says of a node now."""
+        at.let_recover(self._core, self._port_words)
+        tec, rec, left, _ = self._port_words[port.order, confinement.TEC :].tolist()
+        passive = max(tec, rec) >= confinement.PASSIVE_FROM
+        return ErrorState("bus-off" if left else "error-passive" if passive else "error-active", tec, rec)
 
     def exchanges(self, port: Port) -> int:
         """Return how many events a node in another process was asked about."""

@@ -10,13 +10,28 @@ import numpy as np
 from numba import types
 from numba.extending import register_jitable
 
-from dbc.frame import EFF_FLAG
+from dbc.frame import EFF_FLAG, ERR_FLAG
 from dbc.jit import njit
+from hil.bus.confinement import (
+    ERROR_DELIMITER_BITS,
+    ERROR_FLAG_BITS,
+    REC,
+    SEQUENCE_BITS,
+    SEQUENCES_LEFT,
+    SUSPEND_BITS,
+    SUSPENDED_UNTIL,
+    TEC,
+    after_error,
+    after_success,
+    count_sequences,
+    first_bad_bit,
+    is_passive,
+    next_random,
+)
 from hil.bus.link import FRAME, MAX_PACKET, NO_WAKE, TIMER
-from hil.bus.wire_time import classic_bits
+from hil.bus.wire_time import ERROR_BITS_BYTE, INTERMISSION_BITS, classic_bits
 
 NEVER = 1 << 62
-INTERMISSION_BITS = 3
 _NS_PER_S = 1_000_000_000
 _ID_MASK = 0xFFFF_FFFF
 
@@ -35,12 +50,20 @@ _ID_MASK = 0xFFFF_FFFF
     ON_WIRE_HEAD,
     ON_WIRE_DATA,
     ON_WIRE_SENDER,
-) = range(13)
-CORE_SIZE = 13
+    ON_WIRE_READY,
+    ON_WIRE_ORDER,
+    ON_WIRE_BAD_BITS,  # bits up to the end of the error frame that destroys it, 0 if it arrives
+    BUS_OFF,  # whether a node is
+    COUNTED_UNTIL,  # bus time up to which idle bits have been counted for bus-off nodes, ns
+    NOISE_UNTIL,  # end of the noise, ns
+    NOISE_LEVEL,  # probability that a bit is bad, per billion
+    NOISE_STATE,  # of its random numbers
+) = range(21)
+CORE_SIZE = 21
 
 MAX_PORTS = 48
-WAKE, PHASE, DRIFT_PPB, MAILED, LINK, EXCHANGES = range(6)
-PORT_SIZE = 6
+WAKE, PHASE, DRIFT_PPB, MAILED, LINK, EXCHANGES = range(6)  # then those of `hil.bus.confinement`
+PORT_SIZE = 10
 NO_LINK = -1
 """`LINK` of a port whose node is in this process; otherwise it is the descriptor of a SEQPACKET socket."""
 
@@ -62,11 +85,17 @@ MAX_MAIL_FRAMES = 1024
 MAIL_SIZE = FRAMES + MAX_MAIL_FRAMES * FRAME_WORDS
 MAX_ANSWER_FRAMES = MAX_PACKET // (8 * FRAME_WORDS)
 
-# faults at hand-over
+# faults, the last kind when a frame begins, the others at hand-over
 FAULT_ID, FAULT_KIND, FAULT_ARGUMENT, FAULT_COUNT = range(4)
 FAULT_SIZE = 4
 MAX_FAULTS = 64
-DROP, CORRUPT, DELAY, REPEAT = range(1, 5)
+DROP, CORRUPT, DELAY, REPEAT, DESTROY = range(1, 6)
+
+# an error frame in the log, as Linux shows it (linux/can/error.h)
+ERROR_CLASSES = 0x08 | 0x200  # a protocol violation; error counters are given
+ERROR_BUS_OFF = 0x40
+_ERROR_BIT_TYPE = 0x01  # byte 2: a single bit
+_TEC_BYTE, _REC_BYTE = 6, 7
 
 NOBODY, NO_ROOM, NO_ANSWER = -1, -2, -16
 """What `advance` returns at its end, when `queue` or `log` have to grow first, and, minus the port, when
@@ -120,6 +149,8 @@ def _deliver(core, ports, filters, log, mail, head, data, sender):  # type: igno
         port = filters[entry, FILTER_PORT]
         if port in (served, sender) or filters[entry, FILTER_ID] not in (can_id, EVERY_ID):
             continue
+        if ports[port, SEQUENCES_LEFT]:
+            continue
         served = port
         at = FRAMES + ports[port, MAILED] * FRAME_WORDS
         mail[port, at] = local_ns(ports[port, PHASE], ports[port, DRIFT_PPB], now_ns)
@@ -150,12 +181,52 @@ def _take(core, queue, entry):  # type: ignore[no-untyped-def]
 
 
 @register_jitable
-def _arbitrate(core, queue):  # type: ignore[no-untyped-def]
+def _bits_ns(core, bits):  # type: ignore[no-untyped-def]
+    return bits * _NS_PER_S // core[BIT_RATE]
+
+
+@register_jitable
+def _let_recover(core, ports):  # type: ignore[no-untyped-def]
+    """Count the idle bits up to now for bus-off nodes."""
+    if not core[BUS_OFF] or core[END] != NEVER:
+        return
+    idle_ns = core[NOW] - max(core[IDLE], core[COUNTED_UNTIL])
+    sequences = idle_ns * core[BIT_RATE] // (_NS_PER_S * SEQUENCE_BITS)
+    if sequences > 0:
+        core[COUNTED_UNTIL] = max(core[IDLE], core[COUNTED_UNTIL]) + _bits_ns(core, sequences * SEQUENCE_BITS)
+        core[BUS_OFF] = count_sequences(ports, core[PORTS], sequences)
+
+
+@register_jitable
+def _suspended_until(core, ports, sender):  # type: ignore[no-untyped-def]
+    return ports[sender, SUSPENDED_UNTIL] if sender < core[PORTS] else 0
+
+
+@register_jitable
+def _bad_bit(core, faults, can_id, bits):  # type: ignore[no-untyped-def]
+    """Return at which bit the frame that begins is destroyed, -1 if it is not."""
+    for number in range(faults.shape[0]):
+        fault = faults[number]
+        if fault[FAULT_COUNT] and fault[FAULT_KIND] == DESTROY and fault[FAULT_ID] == can_id:
+            fault[FAULT_COUNT] -= 1
+            return min(fault[FAULT_ARGUMENT], bits - 1)
+    if core[NOW] < core[NOISE_UNTIL]:
+        state, uniform = next_random(np.uint64(core[NOISE_STATE]))
+        core[NOISE_STATE] = np.int64(state)
+        good_bits = first_bad_bit(uniform, core[NOISE_LEVEL])
+        if good_bits < bits:
+            return good_bits
+    return -1
+
+
+@register_jitable
+def _arbitrate(core, ports, queue, faults):  # type: ignore[no-untyped-def]
+    _let_recover(core, ports)
     now_ns = core[NOW]
     winner = -1
     for entry in range(core[QUEUED]):
         row = queue[entry]
-        if row[OUT_OF_BAND] or row[READY] > now_ns:
+        if row[OUT_OF_BAND] or row[READY] > now_ns or _suspended_until(core, ports, row[SENDER]) > now_ns:
             continue
         if winner < 0 or (row[KEY], row[SENDER], row[READY], row[ORDER]) < (
             queue[winner, KEY],
@@ -168,8 +239,65 @@ def _arbitrate(core, queue):  # type: ignore[no-untyped-def]
     head = row[HEAD]
     bits = classic_bits(head & _ID_MASK, head >> 32, np.uint64(row[DATA]))
     core[ON_WIRE_HEAD], core[ON_WIRE_DATA], core[ON_WIRE_SENDER] = head, row[DATA], row[SENDER]
-    core[END] = now_ns + (bits - INTERMISSION_BITS) * _NS_PER_S // core[BIT_RATE]
-    core[IDLE] = now_ns + bits * _NS_PER_S // core[BIT_RATE]
+    core[ON_WIRE_READY], core[ON_WIRE_ORDER] = row[READY], row[ORDER]
+    bad_bit = _bad_bit(core, faults, head & _ID_MASK, bits - INTERMISSION_BITS)
+    core[ON_WIRE_BAD_BITS] = 0
+    if bad_bit >= 0:
+        core[ON_WIRE_BAD_BITS] = bad_bit + 1 + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS
+        bits = core[ON_WIRE_BAD_BITS] + INTERMISSION_BITS
+    core[END] = now_ns + _bits_ns(core, bits - INTERMISSION_BITS)
+    core[IDLE] = now_ns + _bits_ns(core, bits)
+
+
+@register_jitable
+def _withdraw(core, queue, sender):  # type: ignore[no-untyped-def]
+    """Forget what a sender has handed over and that has not begun."""
+    kept = 0
+    for entry in range(core[QUEUED]):
+        if queue[entry, SENDER] != sender:
+            queue[kept] = queue[entry]
+            kept += 1
+    core[QUEUED] = kept
+
+
+@register_jitable
+def _destroyed(core, ports, queue, log):  # type: ignore[no-untyped-def]
+    """Log the error frame of what was on the wire; it is sent again unless its sender is bus-off."""
+    sender, head = core[ON_WIRE_SENDER], core[ON_WIRE_HEAD]
+    is_off = after_error(ports, core[PORTS], sender)
+    core[BUS_OFF] = count_sequences(ports, core[PORTS], 0)
+    row = log[core[LOGGED]]
+    row[LOG_TIME], row[LOG_SENDER] = core[NOW], sender
+    row[LOG_HEAD] = ERR_FLAG | ERROR_CLASSES | (ERROR_BUS_OFF if is_off else 0) | 8 << 32
+    data = _ERROR_BIT_TYPE << 16 | core[ON_WIRE_BAD_BITS] << 8 * ERROR_BITS_BYTE
+    if sender < core[PORTS]:
+        data |= min(ports[sender, TEC], 255) << 8 * _TEC_BYTE
+        data |= ports[sender, REC] << 8 * _REC_BYTE
+    row[LOG_DATA] = data
+    core[LOGGED] += 1
+    if is_off:
+        _withdraw(core, queue, sender)
+        return
+    again = queue[core[QUEUED]]
+    again[READY], again[KEY], again[SENDER] = core[ON_WIRE_READY], arbitration_key(head & _ID_MASK), sender
+    again[ORDER], again[HEAD], again[DATA] = core[ON_WIRE_ORDER], head, core[ON_WIRE_DATA]
+    again[OUT_OF_BAND] = 0
+    core[QUEUED] += 1
+
+
+@register_jitable
+def _ended(core, ports, filters, queue, log, mail):  # type: ignore[no-untyped-def]
+    """Do what the end of the frame on the wire brings."""
+    sender = core[ON_WIRE_SENDER]
+    core[END] = NEVER
+    core[BUS_OFF] = core[BUS_OFF] and count_sequences(ports, core[PORTS], 1)  # its end and the intermission
+    if core[ON_WIRE_BAD_BITS]:
+        _destroyed(core, ports, queue, log)
+    else:
+        after_success(ports, core[PORTS], sender)
+        _deliver(core, ports, filters, log, mail, core[ON_WIRE_HEAD], core[ON_WIRE_DATA], sender)
+    if sender < core[PORTS] and is_passive(ports[sender]):
+        ports[sender, SUSPENDED_UNTIL] = core[IDLE] + _bits_ns(core, SUSPEND_BITS)
 
 
 @register_jitable
@@ -183,7 +311,7 @@ def _next(core, ports, queue):  # type: ignore[no-untyped-def]
     for number in range(core[QUEUED]):
         at_ns = queue[number, READY]
         if not queue[number, OUT_OF_BAND]:
-            ready_ns = min(ready_ns, at_ns)
+            ready_ns = min(ready_ns, max(at_ns, _suspended_until(core, ports, queue[number, SENDER])))
         elif at_ns < band_ns or (at_ns == band_ns and queue[number, ORDER] < queue[entry, ORDER]):
             entry, band_ns = number, at_ns
     arbitration_ns = NEVER
@@ -192,7 +320,13 @@ def _next(core, ports, queue):  # type: ignore[no-untyped-def]
     return port, wake_ns, entry, band_ns, arbitration_ns
 
 
-@njit("int64(int64[::1], int64[:,::1], int64[:,::1])")
+@njit("void(int64[::1], int64[:,::1])", depends=("hil.bus.confinement",))
+def let_recover(core, ports):  # type: ignore[no-untyped-def]
+    """Count the idle bits up to now for bus-off nodes."""
+    _let_recover(core, ports)
+
+
+@njit("int64(int64[::1], int64[:,::1], int64[:,::1])", depends=("hil.bus.confinement",))
 def next_event_ns(core, ports, queue):  # type: ignore[no-untyped-def]
     """Return the bus time of the next event, `NEVER` if there is none."""
     _, wake_ns, _, band_ns, arbitration_ns = _next(core, ports, queue)
@@ -200,11 +334,15 @@ def next_event_ns(core, ports, queue):  # type: ignore[no-untyped-def]
 
 
 @register_jitable
-def _hand_over(core, queue, faults, out_of_band, sender, ready_ns, head, data):  # type: ignore[no-untyped-def]
+def _hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, data):  # type: ignore[no-untyped-def]
     can_id = head & _ID_MASK
+    if core[BUS_OFF] and sender < core[PORTS]:
+        _let_recover(core, ports)
+        if ports[sender, SEQUENCES_LEFT]:
+            return
     for number in range(faults.shape[0]):
         fault = faults[number]
-        if fault[FAULT_COUNT] == 0 or fault[FAULT_ID] != can_id:
+        if fault[FAULT_COUNT] == 0 or fault[FAULT_ID] != can_id or fault[FAULT_KIND] == DESTROY:
             continue
         fault[FAULT_COUNT] -= 1
         if fault[FAULT_KIND] == DROP:
@@ -228,7 +366,7 @@ def _hand_over(core, queue, faults, out_of_band, sender, ready_ns, head, data): 
 
 
 @register_jitable
-def _next_question(core, ports, filters, queue, log, mail, until_ns):  # type: ignore[no-untyped-def]
+def _next_question(core, ports, filters, queue, log, mail, faults, until_ns):  # type: ignore[no-untyped-def]
     """Process one event; return the port it asks, `NOBODY` at the end or `ON`, and the packet's length."""
     if core[DUE]:
         for port in range(core[PORTS]):
@@ -243,9 +381,7 @@ def _next_question(core, ports, filters, queue, log, mail, until_ns):  # type: i
         return NOBODY, 0
     core[NOW] = event_ns
     if event_ns == end_ns:
-        core[END] = NEVER
-        head, data, sender = core[ON_WIRE_HEAD], core[ON_WIRE_DATA], core[ON_WIRE_SENDER]
-        _deliver(core, ports, filters, log, mail, head, data, sender)
+        _ended(core, ports, filters, queue, log, mail)
     elif event_ns == wake_ns:
         ports[port, WAKE] = NEVER
         return port, _seal(core, ports, mail, port, TIMER)
@@ -253,17 +389,17 @@ def _next_question(core, ports, filters, queue, log, mail, until_ns):  # type: i
         row = _take(core, queue, entry)
         _deliver(core, ports, filters, log, mail, row[HEAD], row[DATA], row[SENDER])
     else:
-        _arbitrate(core, queue)
+        _arbitrate(core, ports, queue, faults)
     return ON, 0
 
 
 @njit(
-    "void(int64[::1], int64[:,::1], int64[:,::1], int64[::1], int64, int64, int64, int64)",
-    depends=("dbc.frame", "hil.bus.link"),
+    "void(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], int64, int64, int64, int64)",
+    depends=("dbc.frame", "hil.bus.confinement", "hil.bus.link"),
 )
-def hand_over(core, queue, faults, out_of_band, sender, ready_ns, head, data):  # type: ignore[no-untyped-def]
-    """Hand a frame to its sender's CAN controller at bus time `ready_ns`, now or later."""
-    _hand_over(core, queue, faults, out_of_band, sender, ready_ns, head, data)
+def hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, data):  # type: ignore[no-untyped-def]
+    """Hand a frame to its sender's CAN controller at bus time `ready_ns`; bus-off ones take none."""
+    _hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, data)
 
 
 @register_jitable
@@ -274,7 +410,7 @@ def _apply(core, ports, queue, faults, out_of_band, answer, length, port):  # ty
         ports[port, WAKE] = max(bus_ns(phase_ns, drift_ppb, answer[0]), core[NOW])
     for at in range(1, length // 8, FRAME_WORDS):
         ready_ns = bus_ns(phase_ns, drift_ppb, answer[at])
-        _hand_over(core, queue, faults, out_of_band, port, ready_ns, answer[at + 1], answer[at + 2])
+        _hand_over(core, ports, queue, faults, out_of_band, port, ready_ns, answer[at + 1], answer[at + 2])
 
 
 @register_jitable
@@ -290,7 +426,7 @@ def _exchange(ports, mail, answer, port, length):  # type: ignore[no-untyped-def
 @njit(
     "int64(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1],"
     " int64[:,::1], int64[:,::1], int64[:,::1], int64, int64, int64)",
-    depends=("hil.bus.wire_time", "hil.bus.link", "dbc.frame"),
+    depends=("hil.bus.confinement", "hil.bus.wire_time", "hil.bus.link", "dbc.frame"),
 )
 def advance(  # type: ignore[no-untyped-def]
     core, ports, mail, faults, out_of_band, answer, filters, queue, log, length, port, until_ns
@@ -314,7 +450,7 @@ def advance(  # type: ignore[no-untyped-def]
     while True:
         if core[LOGGED] == log.shape[0] or core[QUEUED] + MAX_ANSWER_FRAMES > queue.shape[0]:
             return NO_ROOM
-        asked, length = _next_question(core, ports, filters, queue, log, mail, until_ns)
+        asked, length = _next_question(core, ports, filters, queue, log, mail, faults, until_ns)
         if asked == ON:
             continue
         if asked < 0:

@@ -10,11 +10,15 @@ import numpy as np
 from can.util import dlc2len, len2dlc
 from numpy.typing import NDArray
 
-from dbc.frame import EFF_FLAG
+from dbc.frame import EFF_FLAG, ERR_FLAG
 from dbc.jit import njit
 
 RTR_FLAG = 0x4000_0000
 """Set in an identifier word for a remote frame, as in SocketCAN's `can_id`."""
+
+INTERMISSION_BITS = 3
+ERROR_BITS_BYTE = 5
+"""Byte of an error frame's data in a log: bits from the start of what it destroyed to its own end."""
 
 CRC15_POLYNOMIAL = 0x4599
 UNSTUFFED_BITS = 13
@@ -113,8 +117,18 @@ def worst_case_bits(can_id: int, dlc: int) -> int:
 
 
 def traffic_bits(traffic: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the length of each frame of a log in bits; its rows are time, id, dlc, data."""
-    return np.array([classic_bits(*frame) for _, *frame in traffic.tolist()], np.int64)
+    """Return the length in bits of each frame of a log, error frames with what they destroyed.
+
+    Its rows are time, id, dlc, data.
+    """
+    return np.array([_logged_bits(*frame) for _, *frame in traffic.tolist()], np.int64)
+
+
+def _logged_bits(can_id: int, dlc: int, data: int) -> int:
+    if can_id & ERR_FLAG:
+        return (data >> 8 * ERROR_BITS_BYTE & 0xFF) + INTERMISSION_BITS
+    bits: int = classic_bits(can_id, dlc, data)
+    return bits
 
 
 def fd_bits(message: can.Message) -> tuple[int, int]:

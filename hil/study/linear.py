@@ -163,9 +163,9 @@ def scheduled_model(
 ) -> StateSpace:
     """Return the scheduled observer, feedback and command filter from position (m) to command (rad/s).
 
-    b0, a1n and the gains that follow them are those at `position_m`; the speed per rod speed is the mean of
-    both directions. States: z1, z2, z3, the disturbance as a speed, the motor's model, and the command sent
-    last.
+    b0, a1n and the gains that follow them are those at `position_m`; the observer's motor speed per rod speed
+    is the mean of both directions, between which it has a kink at rest. States: z1, z2, z3, the disturbance
+    as a speed, the motor's model, and the command sent last.
     """
     stiff = gains.stiffness(position_m)
     b0 = gains.b0_m_s2_per_rad * stiff

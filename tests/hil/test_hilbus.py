@@ -22,8 +22,8 @@ from hil.bus import link
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.wire import Wire
-from hil.bus.wire_core import INTERMISSION_BITS, MAX_PORTS
-from hil.bus.wire_time import frame_bits
+from hil.bus.wire_core import MAX_PORTS
+from hil.bus.wire_time import INTERMISSION_BITS, frame_bits
 
 
 def message(can_id: int = 0x123, data: bytes = b"\x01\x02\x03", extended: bool = False) -> can.Message:

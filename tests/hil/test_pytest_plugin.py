@@ -68,12 +68,12 @@ def test_nominal(bench):
     assert bench.result("")["machine"]["mass"] == 1.0
 
 def test_one_after_another(bench_at):
-    benches = []
-    for machine in ({}, HEAVY):
-        benches.append(bench_at(position_m=0.2, machine=machine))
-        benches[-1].run(0.05)
-    nominal, heavy = [bench.position_mm.last for bench in benches]
-    assert nominal != heavy
+    def rest_mm(machine):
+        bench = bench_at(position_m=0.2, machine=machine)
+        bench.run(0.05)
+        return bench.position_mm.last
+
+    assert rest_mm({}) == rest_mm({}) != rest_mm(HEAVY)
 
 @pytest.mark.bench(machine={"mass": 99})
 def test_too_heavy(bench):
@@ -250,7 +250,10 @@ def test_a_need_that_nothing_has_is_refused(tmp_path):
 def test_a_beginning_that_a_bench_does_not_have_is_named(tmp_path):
     mistyped = USER_TESTS.replace('controller="pi"', 'control="pi"')
     session = user_session(tmp_path, mistyped, "--hil-mode=inprocess", "-k", "begins_as_marked")
-    assert "a bench takes no 'control': choose from controller, position_m, bit_rate" in session.said
+    assert (
+        "a bench takes no 'control': choose from controller, position_m, bit_rate, machine, tuning"
+        in session.said
+    )
     assert "TypeError" not in session.said
 
 

@@ -10,8 +10,8 @@ import pytest
 import dbc
 from dbc.frame import EFF_FLAG, Frame
 from hil.bus.wire import Wire
-from hil.bus.wire_core import INTERMISSION_BITS, LOG_HEAD, LOG_TIME, arbitration_key
-from hil.bus.wire_time import classic_bits, worst_case_bits
+from hil.bus.wire_core import LOG_HEAD, LOG_TIME, arbitration_key
+from hil.bus.wire_time import INTERMISSION_BITS, classic_bits, worst_case_bits
 from hil.cli import main
 from hil.study.response_time import Traffic, load, response_times
 from hil.study.rta_command import cyclic_traffic
