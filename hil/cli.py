@@ -41,7 +41,7 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
-from hil.study import reproduce, rta_command, sweep_command
+from hil.study import reproduce, rta_command, sweep_command, tune_command
 from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
@@ -123,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     sweep_command.add_command(commands)
+    tune_command.add_command(commands)
 
     bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
     bus.set_defaults(command=_bus)
