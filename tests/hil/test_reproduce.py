@@ -44,8 +44,7 @@ ROOT = Path(__file__).parents[2]
 PICTURES = {f"figure_{number}" for number in ("3b", 5, 6, 7, 8)} | {
     "comparison",
     "rivals",
-    "stability_held",
-    "stability_shut",
+    "stability",
 }
 
 
