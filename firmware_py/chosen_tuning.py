@@ -7,7 +7,7 @@ from pathlib import Path
 from firmware_py.calibration import Calibration, CalibrationError
 from firmware_py.tuning import TUNINGS
 
-DEFAULT_TUNING = "paper"
+DEFAULT_TUNING = "robust"
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 A test that takes the fixture `bench` gets a machine that is brought up and enabled::
 
+    @pytest.mark.bench(tuning="paper")
     def test_load_is_rejected(bench):
         bench.setpoint(sine)
         bench.run(3.0)

@@ -83,7 +83,7 @@ def stall(bench: Bench) -> str:
     """Say which stall of the machine justifies that a side stopped in real time, or nothing."""
     timing = bench.timing
     for name, age in (("feedback", timing.feedback_age_us), ("setpoint", timing.setpoint_age_us)):
-        if age.max >= _STALE_AGE_US:
+        if age.known.size and age.max >= _STALE_AGE_US:
             return f"the {name} was {age.max / 1e3:.1f} periods old"
     if len(timing.missed_periods) >= _STALE_PERIODS:
         return f"the commands of {len(timing.missed_periods)} periods were missed"

@@ -16,6 +16,23 @@ GATES = {  # mm RMS, mm max
     "lift_lower_load": (0.45, 2.1),
     "full_stroke": (0.15, 0.8),
 }
+HARD_CORNER = {
+    "mass": 1.5,
+    "bulk_modulus": 0.3,
+    "leak": 2.5,
+    "efficiency": 0.7,
+    "motor_time_constant_s": 0.02,
+    "motor_acceleration_rad_s2": 2000.0,
+    "position_lsb_um": 10,
+    "delay_periods": 3,
+}
+ROBUST_GATES = {  # mm RMS, mm max
+    "sine": (0.10, 0.20),
+    "sine_load": (0.42, 2.8),
+    "lift_lower": (0.32, 1.5),
+    "lift_lower_load": (0.42, 2.1),
+    "full_stroke": (0.26, 1.25),
+}
 README = {  # mm RMS, mm max
     ("sine", "p"): (3.060, 5.007),
     ("sine", "pi"): (1.262, 2.080),
@@ -35,6 +52,24 @@ def test_adrc_meets_its_gate(bench, scenario):
     play(bench, scenario)
     assert bench.error_mm.rms <= rms_mm
     assert bench.error_mm.max <= max_mm
+
+
+@virtual_time
+@pytest.mark.parametrize("scenario", ROBUST_GATES)
+def test_robust_meets_its_gate(bench_at, scenario):
+    bench = bench_at(tuning="robust", controller="scheduled")
+    rms_mm, max_mm = ROBUST_GATES[scenario]
+    play(bench, scenario)
+    assert bench.error_mm.rms <= rms_mm
+    assert bench.error_mm.max <= max_mm
+
+
+@virtual_time
+@pytest.mark.parametrize("scenario", ROBUST_GATES)
+def test_robust_keeps_within_2_mm_rms_on_a_heavy_machine_with_soft_oil_and_worn_pumps(bench_at, scenario):
+    bench = bench_at(tuning="robust", controller="scheduled", machine=HARD_CORNER)
+    play(bench, scenario)
+    assert bench.error_mm.rms <= 2.0
 
 
 @virtual_time

@@ -20,7 +20,7 @@ RUN = 2
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("vcan_sine")
-    command = [sys.executable, "-m", "hil", "run", "sine", "--mode", "realtime"]
+    command = [sys.executable, "-m", "hil", "run", "sine", "--tuning", "paper", "--mode", "realtime"]
     command += ["-i", "socketcan", "-c", "vcan0", "--rt-ratio", RT_RATIO]
     command += ["--duration", "1", "--out", str(out), "--start-timeout", "300"]
     finished = subprocess.run(command, capture_output=True, text=True)

@@ -96,7 +96,7 @@ def test_the_gains_file_says_all_gains(name):
 
 def test_the_block_is_what_the_bench_takes(tmp_path, capsys):
     file = tmp_path / "new" / "p.cal"
-    options = "--tuning robust --samples 2 --seed 3 --evaluations 1 --workers 1".split()
+    options = ["--tuning", "robust", "--samples", "2", "--seed", "3", "--evaluations", "1", "--workers", "1"]
     code = main(["tune", *options, "--out", str(file)])
     shown = capsys.readouterr()
     assert code == 0
