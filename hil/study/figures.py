@@ -34,8 +34,8 @@ _COLOURS = {
     "robust ADRC": VERMILION,
 }
 _MORE_COLOURS = (GREY, "#5d3a9b", "#7f6000", "#994f00")
-MAPPED_POINTS = ("shut", "held")
-"""Operating points with a heat map each."""
+MAPPED_POINT = "held"
+"""Operating point with a heat map."""
 
 _DRAWN_BINS = 900
 _WIDTH_IN = 8.5

@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from hil.study import paper
 from hil.study.evaluation import METRICS
-from hil.study.figures import MAPPED_POINTS
+from hil.study.figures import MAPPED_POINT
 
 
 def page(tables: Mapping[str, Any], pictures: Mapping[str, Path]) -> str:
@@ -34,7 +34,7 @@ def page(tables: Mapping[str, Any], pictures: Mapping[str, Path]) -> str:
             for free, loaded in paper.WITH_LOAD.items()
             if loaded in tables["scenarios"]
         ],
-        mapped_points=MAPPED_POINTS,
+        mapped_point=MAPPED_POINT,
         pictures={name: _data_uri(path) for name, path in pictures.items()},
     )
 

@@ -135,10 +135,7 @@ def _drawings(
     traces = {name: evaluation.traces(name) for name in evaluation.scenarios}
     papers = [one.label for one in evaluation.taking_part if one.in_paper]
     pictures: list[tuple[str, Callable[..., figures.Draw], tuple[Any, ...]]] = [
-        *(
-            (f"stability_{point}", heat_map, (evaluation.stability[point].maps,))
-            for point in figures.MAPPED_POINTS
-        ),
+        ("stability", heat_map, (evaluation.stability[figures.MAPPED_POINT].maps,)),
         *(
             (
                 f"figure_{paper.CASES[name].figure}",
@@ -202,7 +199,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
 
 
 def _of_an_earlier_run(out: Path) -> Iterable[Path]:
-    names = "figure_*", "rivals", "comparison", "stability*"
+    names = "figure_*", "rivals", "comparison", "stability"
     return [path for name in names for suffix in (".svg", ".png") for path in out.glob(name + suffix)]
 
 

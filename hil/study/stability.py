@@ -22,6 +22,7 @@ from plant_sim.machine import Machine
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 POSITIONS_M = np.array([0.3, 1, 3, 10, *range(20, 381, 20), 385, 390, 395]) * 1e-3
 """Denser where a chamber is small: a grid that ends at 370 mm has hidden an unstable design."""
@@ -167,27 +168,29 @@ def heat_map(maps: Mapping[str, StabilityMap]) -> Callable[["Figure"], None]:
         figure.set_size_inches(_WIDTH_IN, len(maps) * (0.6 + _ROW_IN * rows))
         panels = figure.subplots(len(maps), 2, squeeze=False, sharex=True)
         for axes_pair, (label, one) in zip(panels, maps.items(), strict=True):
-            _panel(figure, axes_pair[0], one, one.loop.spectral_radius, _RADIUS_SHOWN)
-            _panel(figure, axes_pair[1], one, one.loop.ms, _MS_SHOWN)
+            images = (
+                _panel(axes_pair[0], one, one.loop.spectral_radius, _RADIUS_SHOWN),
+                _panel(axes_pair[1], one, one.loop.ms, _MS_SHOWN),
+            )
             axes_pair[0].set_title(f"{label}: spectral radius", loc="left")
             axes_pair[1].set_title(f"{label}: peak of sensitivity Ms", loc="left")
             axes_pair[0].set_yticks(range(len(one.machines)), [describe(machine) for machine in one.machines])
             axes_pair[1].set_yticks([])
+        for column, image in enumerate(images):
+            figure.colorbar(image, ax=panels[:, column], location="top", extend="both", aspect=40, pad=0.005)
         for axes in panels[-1]:
             axes.set_xlabel("position / mm (× unstable)")
 
     return draw
 
 
-def _panel(
-    figure: "Figure", axes: "Axes", shown: StabilityMap, values: np.ndarray, span: tuple[float, float]
-) -> None:
+def _panel(axes: "Axes", shown: StabilityMap, values: np.ndarray, span: tuple[float, float]) -> "AxesImage":
     """Draw one quantity, brighter being nearer to instability, and a cross on each unstable cell."""
     image = axes.imshow(values, aspect="auto", cmap="cividis", vmin=span[0], vmax=span[1])
-    figure.colorbar(image, ax=axes, extend="both")
     row, column = np.nonzero(~shown.loop.stable)
     axes.plot(column, row, "x", color="#d55e00", markersize=3.0)
     ticks = [int(np.argmin(np.abs(shown.positions_m - at_mm * 1e-3))) for at_mm in _TICKS_MM]
     axes.set_xticks(ticks, [f"{shown.positions_m[tick] * 1e3:g}" for tick in ticks])
     axes.tick_params(axis="y", labelsize=5.0, length=0.0)
     axes.grid(visible=False)
+    return image

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dbc.contract import Contract
+from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.tuning import AdrcTuning
 from hil.measure import trace_of
 from hil.run.inprocess import run_inprocess
@@ -85,7 +86,9 @@ def test_the_observer_lags_the_truth_as_a_linear_observer_of_its_bandwidth():
     adrc = AdrcTuning()
     omega, a1n = adrc.omega_o_rad_s, adrc.a1n_per_s2
     linear_lag_ms = 1e3 * (4 * omega**3 - 4 * omega * a1n) / omega**4
-    recording = run_inprocess(RunOptions(scenario=load_scenario("sine"), record_directory=Path()))
+    recording = run_inprocess(
+        RunOptions(scenario=load_scenario("sine"), tuning=chosen_tuning("paper"), record_directory=Path())
+    )
     assert recording.plant is not None
     played = recording.plant["time_ns"] >= recording.start_ns
     true = true_disturbance_m_s3({name: column[played] for name, column in recording.plant.items()}, adrc)
