@@ -204,6 +204,12 @@ def _run(arguments: argparse.Namespace) -> int:
     else:
         Console().print(_table(result))
         print(f"{', '.join(file.name for file in files)} in {out}")
+    if scenario.limits and not result["limits"]:
+        judged = ", ".join(scenario.limits)
+        print(
+            f"hil: not judged: {scenario.name} has limits for {judged}, none for {result['controller']}",
+            file=sys.stderr,
+        )
     if recording.ending or result["verdict"]:
         print(f"hil: {recording.ending or result['verdict']}", file=sys.stderr)
     if recording.broken:

@@ -21,7 +21,7 @@ def rig() -> Iterator[InprocessRig]:
 
 def test_step_by_step_it_plays_what_hil_run_plays(rig):
     scenario = load_scenario("sine_load")
-    bench = Bench(rig)
+    bench = Bench(rig, controller="adrc")
     bench.setpoint(scenario.position_m)
     bench.run(3.0)
     bench.load_force(-2000)

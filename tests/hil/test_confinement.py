@@ -298,7 +298,7 @@ def test_a_log_keeps_error_frames(tmp_path, bus):
 @pytest.fixture
 def bench(tmp_path):
     with InprocessRig(RigOptions(record_directory=tmp_path)) as rig:
-        bench = Bench(rig, position_m=0.2)
+        bench = Bench(rig, controller="adrc", position_m=0.2)
         bench.setpoint(lambda t: 0.2 + 0.05 * np.sin(2 * np.pi * 0.5 * t))
         bench.run(0.5)
         yield bench

@@ -98,7 +98,8 @@ def test_neither_hash_seed_nor_load_changes_a_lockstep_run(tmp_path, monkeypatch
 
 
 def test_the_hash_seed_does_not_change_a_run_in_one_process(tmp_path, hashes):
-    command = ["run", "sine", "--mode", "inprocess", "--duration", "1", "--json", "--out", str(tmp_path)]
+    command = ["run", "sine", "--controller", "adrc", "--mode", "inprocess", "--duration", "1", "--json"]
+    command += ["--out", str(tmp_path)]
     ended = hil(*command, PYTHONHASHSEED="4321")
     assert json.loads(ended.stdout)["bus_sha256"] == hashes(SINE)
 

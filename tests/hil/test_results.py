@@ -22,7 +22,7 @@ from hil.supervisor import BRING_UP_PERIODS
 CONTRACT = Contract.load()
 PERIODS = 10_000
 FILES = {"result.json", "trace.csv", "bus.log", "picture.png"}
-RUN = ("run", "sine", "--mode", "inprocess")
+RUN = ("run", "sine", "--mode", "inprocess", "--tuning", "paper")
 
 
 @pytest.fixture(scope="module")
@@ -238,11 +238,22 @@ def test_missed_limits_are_an_exit_code_of_their_own(tmp_path):
     strict.write_text(
         'title = "hard"\nreference = "sine"\nduration_s = 0.3\n[limits.adrc]\nrms_mm = 1e-6\nmax_mm = 1e-6\n'
     )
-    assert cli.main(["run", str(strict), "--mode", "inprocess", "--out", str(tmp_path / "out")]) == 1
+    run = ["run", str(strict), "--mode", "inprocess", "--out", str(tmp_path / "out")]
+    assert cli.main([*run, "--controller", "adrc"]) == 1
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["within_limits"] is False
     assert result["scenario"] == "strict"
     assert result["paper"] is None
+
+
+def test_limits_for_other_laws_than_the_one_played_are_mentioned(tmp_path, capsys):
+    scenario = tmp_path / "other.toml"
+    scenario.write_text(
+        'title = "other"\nreference = "sine"\nduration_s = 0.1\n[limits.pi]\nrms_mm = 1\nmax_mm = 1\n'
+    )
+    assert cli.main(["run", str(scenario), "--mode", "inprocess", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert said == "hil: not judged: other has limits for pi, none for scheduled\n"
 
 
 def test_without_limits_there_are_none_to_miss(tmp_path):
