@@ -373,5 +373,5 @@ TUNINGS = {
 }
 """The built-in calibrations by name; each has the law it is named for as its default.
 
-pi_ff is the rival with the plain velocity feed-forward of section 4's gains made to hold over the box.
+pi_ff is the rival with plain velocity feed-forward, its gains made to hold over the box.
 """

@@ -157,7 +157,9 @@ class Bench:
         self._spoil(message, FrameFault.DESTROY, bit, count)
 
     def disturb(self, bit_error_rate: float, duration_s: float, seed: int = 0) -> None:
-        """Let every bit on the wire be bad with a probability, for some time."""
+        """Let every bit be bad with a probability, for some time; see `hil.bus.wire.Wire.disturb`."""
+        if not 0.0 < duration_s < np.inf:
+            raise ValueError(f"noise takes time, not {duration_s} s")
         self._wire("disturb").disturb(bit_error_rate, round(duration_s * 1e9), seed)
 
     def error_state(self, node: str) -> ErrorState:

@@ -136,8 +136,11 @@ def figures_of(
 
 
 def setting_of(options: RigOptions) -> dict[str, Any]:
-    """Return what the firmware was calibrated with and what the plant was."""
-    return {"tuning": options.tuning.name, "machine": asdict(options.machine)}
+    """Return the firmware's tuning and the plant's machine; None of a side that was started elsewhere."""
+    return {
+        "tuning": options.tuning.name if "controller" in options.started else None,
+        "machine": asdict(options.machine) if "plant" in options.started else None,
+    }
 
 
 def result_of(

@@ -265,13 +265,26 @@ class Wire:
     def disturb(self, bit_error_rate: float, duration_ns: int, seed: int = 0) -> None:
         """Let every bit be bad with a probability, from now on; each bad one destroys the frame it is in.
 
+        Parameters
+        ----------
+        bit_error_rate : float
+            From 1e-9 to 0.5, in steps of 1e-9.
+        duration_ns : int
+            How long.
+        seed : int
+            Of the random numbers, 0 to 2**63 - 1.
+
         Raises
         ------
         ValueError
-            If the rate is not from 1e-9 to 0.5.
+            If one of them is not as said.
         """
         if not 1e-9 <= bit_error_rate <= 0.5:
             raise ValueError(f"a bit error rate is from 1e-9 to 0.5, not {bit_error_rate}")
+        if duration_ns <= 0:
+            raise ValueError(f"noise takes time, not {duration_ns} ns")
+        if not 0 <= seed < 1 << 63:
+            raise ValueError(f"a seed is from 0 to 2**63 - 1, not {seed}")
         noise = self.now_ns + duration_ns, round(bit_error_rate * 1e9), seed
         self._core[[at.NOISE_UNTIL, at.NOISE_LEVEL, at.NOISE_STATE]] = noise
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import expm
 
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import (
@@ -29,6 +30,8 @@ from plant_sim.parameters import PlantParameters
 
 FREQUENCIES_RAD_S = np.geomspace(0.1, np.pi / PERIOD_S, 200)
 """Where the sensitivity is looked at, up to Nyquist; each loop's own eigenfrequencies are added."""
+_DEFECTIVE = 1e10
+"""Condition of the eigenvectors from which on they span nothing that can be computed with."""
 REFINEMENT = 33
 """Points between the neighbours of the highest one, in a second look."""
 
@@ -101,6 +104,22 @@ def plant_model(machine: Machine, position_m: float, point: str = "held") -> Sta
     return driven_plant(*OPERATING_POINTS[point](machine.parameters, position_m), machine)
 
 
+def _sampled(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a and b of a system whose input is held over a period."""
+    rates, modes = np.linalg.eig(a)
+    if np.linalg.cond(modes) > _DEFECTIVE:
+        held = np.zeros((len(b) + 1, len(b) + 1))
+        held[:-1, :-1], held[:-1, -1] = a, b
+        grown = expm(held * PERIOD_S)
+        return grown[:-1, :-1], grown[:-1, -1]
+    # else by eigenvectors: scipy's expm waits for BLAS threads, ten times as long on a busy machine
+    inverse = np.linalg.inv(modes)
+    gathered = np.where(
+        rates == 0.0, PERIOD_S, np.expm1(rates * PERIOD_S) / np.where(rates == 0.0, 1.0, rates)
+    )
+    return ((modes * np.exp(rates * PERIOD_S)) @ inverse).real, ((modes * gathered) @ inverse @ b).real
+
+
 def driven_plant(a: np.ndarray, b: np.ndarray, machine: Machine) -> StateSpace:
     """Return what `plant_model` does, from a linearisation; of the machine, only its drive counts."""
     bandwidth = 1.0 / machine.motor_time_constant_s
@@ -108,17 +127,11 @@ def driven_plant(a: np.ndarray, b: np.ndarray, machine: Machine) -> StateSpace:
     continuous[:4, :4] = a
     continuous[:4, 4] = b
     continuous[4, 4] = -bandwidth
-    # by eigenvectors: scipy's expm waits for BLAS threads, ten times as long on a busy machine
-    rates, modes = np.linalg.eig(continuous)
-    inverse = np.linalg.inv(modes)
-    growth = np.exp(rates * PERIOD_S)
-    gathered = np.where(
-        rates == 0.0, PERIOD_S, np.expm1(rates * PERIOD_S) / np.where(rates == 0.0, 1.0, rates)
-    )
+    sampled, driven = _sampled(continuous, np.array([0.0, 0.0, 0.0, 0.0, bandwidth]))
     order = 5 + MAX_DELAY_PERIODS
     model = StateSpace(np.zeros((order, order)), np.zeros(order), np.zeros(order), np.zeros(()))
-    model.a[:5, :5] = ((modes * growth) @ inverse).real
-    model.a[:5, 4 + machine.delay_periods] = bandwidth * ((modes * gathered) @ inverse[:, 4]).real
+    model.a[:5, :5] = sampled
+    model.a[:5, 4 + machine.delay_periods] = driven
     model.a[6:, 5:-1] = np.eye(MAX_DELAY_PERIODS - 1)
     model.b[5] = 1.0
     model.c[0] = 1.0

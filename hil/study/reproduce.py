@@ -187,8 +187,6 @@ def _reproduce(arguments: argparse.Namespace) -> int:
         Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
     ):
         tables, made = evaluate(folder.scratch, list(paper.CASES), contestants(), cores, stopped, progress)
-        for old in _of_an_earlier_run(arguments.out):
-            old.unlink()
         folder.move_in(made)
     if arguments.json:
         print(_json(tables), end="")
@@ -196,11 +194,6 @@ def _reproduce(arguments: argparse.Namespace) -> int:
         Console().print(summary(tables))
         print(f"report.html, tables.json and {len(made) - 2} pictures in {arguments.out}")
     return 0
-
-
-def _of_an_earlier_run(out: Path) -> Iterable[Path]:
-    names = "figure_*", "rivals", "comparison", "stability"
-    return [path for name in names for suffix in (".svg", ".png") for path in out.glob(name + suffix)]
 
 
 def _json(tables: dict[str, Any]) -> str:

@@ -27,23 +27,23 @@ class Traffic:
         Identifier, `dbc.frame.EFF_FLAG` set for a 29-bit one; the priority.
     bits : int
         Longest frame, stuff bits and intermission included.
-    period_ns : int
-        Shortest time between two instances.
+    period_ns : int or None
+        Shortest time between two instances; None if there is no such limit.
     jitter_ns : int
         Longest time from an instance's event to its frame being ready to send.
     deadline_ns : int or None
-        Latest end of the frame after the event; None means the period.
+        Latest end of the frame after the event; None means the period, if there is one.
     """
 
     name: str
     can_id: int
     bits: int
-    period_ns: int
+    period_ns: int | None
     jitter_ns: int = 0
     deadline_ns: int | None = None
 
     @property
-    def due_ns(self) -> int:
+    def due_ns(self) -> int | None:
         """The deadline that counts."""
         return self.period_ns if self.deadline_ns is None else self.deadline_ns
 
@@ -73,18 +73,23 @@ class ResponseTime:
     instances: int
 
     @property
-    def met(self) -> bool:
-        """Whether every instance meets its deadline."""
+    def met(self) -> bool | None:
+        """Whether every instance meets its deadline; None if it has none."""
+        if self.traffic.due_ns is None:
+            return None
         return self.worst_ns is not None and self.worst_ns <= self.traffic.due_ns
 
 
 def load(messages: Iterable[Traffic], bit_rate: int) -> Fraction:
-    """Return the share of bus time that the messages take at most."""
-    return sum((Fraction(m.bits * NS_PER_S, m.period_ns * bit_rate) for m in messages), Fraction(0))
+    """Return the share of bus time that the messages with a period take at most."""
+    shares = (Fraction(m.bits * NS_PER_S, m.period_ns * bit_rate) for m in messages if m.period_ns)
+    return sum(shares, Fraction(0))
 
 
 def response_times(messages: Iterable[Traffic], bit_rate: int) -> list[ResponseTime]:
     """Return the worst case of each message, in order of priority.
+
+    A message without a period blocks those above it; below it, and for itself, there is no bound.
 
     Parameters
     ----------
@@ -102,8 +107,8 @@ def response_times(messages: Iterable[Traffic], bit_rate: int) -> list[ResponseT
     for message, following in pairwise(ordered):
         if message.can_id == following.can_id:
             raise ValueError(f"{message.name} and {following.name} have one identifier {message.can_id:#x}")
-    if slow := [message.name for message in ordered if message.period_ns <= 0]:
-        raise ValueError(f"{slow[0]} has no period: without one there is no bound on anything below it")
+    if wrong := [message for message in ordered if message.period_ns is not None and message.period_ns <= 0]:
+        raise ValueError(f"{wrong[0].name} has a period of {wrong[0].period_ns} ns, must be positive")
     return [_worst_case(ordered, rank, bit_rate) for rank in range(len(ordered))]
 
 
@@ -111,19 +116,26 @@ def _worst_case(ordered: Sequence[Traffic], rank: int, bit_rate: int) -> Respons
     durations = [-(-message.bits * NS_PER_S // bit_rate) for message in ordered]
     bit_ns = -(-NS_PER_S // bit_rate)
     this, duration_ns = ordered[rank], durations[rank]
-    higher = list(zip(ordered[:rank], durations, strict=False))
     blocking_ns = max(durations[rank + 1 :], default=0)
-    if load(ordered[: rank + 1], bit_rate) >= 1:
+    competing = [  # those above it and itself: period, jitter, duration
+        (message.period_ns, message.jitter_ns, cost_ns)
+        for message, cost_ns in zip(ordered[: rank + 1], durations, strict=False)
+        if message.period_ns is not None
+    ]
+    if len(competing) <= rank or load(ordered[: rank + 1], bit_rate) >= 1:
         return ResponseTime(this, duration_ns, blocking_ns, None, 0)
+    period_ns, higher = competing[-1][0], competing[:-1]
 
-    def interference_ns(over_ns: int, competing: Iterable[tuple[Traffic, int]]) -> int:
-        return sum(-(-(over_ns + k.jitter_ns) // k.period_ns) * cost_ns for k, cost_ns in competing)
+    def interference_ns(over_ns: int, competing: Iterable[tuple[int, int, int]]) -> int:
+        return sum(
+            -(-(over_ns + jitter_ns) // every_ns) * cost_ns for every_ns, jitter_ns, cost_ns in competing
+        )
 
     busy_ns, before_ns = duration_ns, 0
     while busy_ns != before_ns:
         before_ns = busy_ns
-        busy_ns = blocking_ns + interference_ns(before_ns, [*higher, (this, duration_ns)])
-    instances = -(-(busy_ns + this.jitter_ns) // this.period_ns)
+        busy_ns = blocking_ns + interference_ns(before_ns, competing)
+    instances = -(-(busy_ns + this.jitter_ns) // period_ns)
 
     worst_ns = 0
     waiting_ns = blocking_ns
@@ -133,7 +145,7 @@ def _worst_case(ordered: Sequence[Traffic], rank: int, bit_rate: int) -> Respons
             before_ns = waiting_ns
             queued_ns = interference_ns(before_ns + bit_ns, higher)
             waiting_ns = blocking_ns + instance * duration_ns + queued_ns
-        response_ns = this.jitter_ns + waiting_ns - instance * this.period_ns + duration_ns
+        response_ns = this.jitter_ns + waiting_ns - instance * period_ns + duration_ns
         worst_ns = max(worst_ns, response_ns)
         waiting_ns += duration_ns
     return ResponseTime(this, duration_ns, blocking_ns, worst_ns, instances)

@@ -47,7 +47,7 @@ SEARCHES = {
         {"omega_o_rad_s": (30.0, 400.0), "omega_c_rad_s": (20.0, 450.0)},
     ),
 }
-"""By name of the built-in tuning that came out."""
+"""By the rival's name. `linear` is what came out; `pi_star` is a softer one, what comes out cycles."""
 
 
 def limit_plants() -> StateSpace:

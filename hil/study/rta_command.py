@@ -16,6 +16,7 @@ from hil.run.options import DEFAULT_BIT_RATE, check_bit_rate
 from hil.study.response_time import ResponseTime, Traffic, load, response_times
 
 EXIT_OK, EXIT_MISSED = range(2)
+_VERDICTS = {True: "met", False: "[red]missed[/red]", None: "no deadline"}
 _NS_PER_MS = 1_000_000
 _MAX_CLASSIC_DLC = 8
 
@@ -25,8 +26,9 @@ def add_command(commands: Any) -> None:
     parser = commands.add_parser(
         "rta",
         help="worst-case response time of every message of the DBC",
-        description="Worst-case response times (Davis et al. 2007) of the cyclic messages of a DBC. "
-        "Each node sends its frames by priority; a message with a cycle time is taken to come no oftener.",
+        description="Worst-case response times (Davis et al. 2007) of the messages of a DBC. "
+        "Each node sends its frames by priority; a message with a cycle time is taken to come no oftener, "
+        "below one without there is no bound. The bench channel is left out.",
         epilog="exit codes: 0 every message meets its deadline at every bit rate asked for; 1 one does not; "
         "2 wrong input",
     )
@@ -46,10 +48,10 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="print figures instead of tables")
 
 
-def cyclic_traffic(dbc: Path, jitter_ns: int = 0) -> tuple[list[Traffic], list[str], int]:
-    """Return the cyclic messages of a DBC, the names of those left out, and its bit rate.
+def traffic_of(dbc: Path, jitter_ns: int = 0) -> tuple[list[Traffic], int]:
+    """Return the messages of a DBC but those of the bench channel, and its bit rate.
 
-    Left out is what has no ``GenMsgCycleTime`` and what belongs to the bench channel.
+    A message without ``GenMsgCycleTime`` has no period.
 
     Raises
     ------
@@ -65,42 +67,41 @@ def cyclic_traffic(dbc: Path, jitter_ns: int = 0) -> tuple[list[Traffic], list[s
         reason = " ".join(str(error).split())
         raise ContractError(f"{dbc}: cannot be read ({reason}): check the path and the file") from error
     assert isinstance(database, Database)
-    traffic, left_out = [], []
+    traffic = []
     for message in database.messages:
         attributes = message.dbc.attributes if message.dbc else {}
-        bench_channel = "BenchChannel" in attributes and attributes["BenchChannel"].value
-        if not message.cycle_time or bench_channel:
-            left_out.append(message.name)
+        if "BenchChannel" in attributes and attributes["BenchChannel"].value:
             continue
         if message.is_fd or message.length > _MAX_CLASSIC_DLC:
             raise ContractError(f"{dbc}: {message.name} is no classic CAN frame: the analysis is for those")
         can_id = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
+        period_ns = message.cycle_time * _NS_PER_MS if message.cycle_time else None
         bits = worst_case_bits(can_id, message.length)
-        traffic.append(Traffic(message.name, can_id, bits, message.cycle_time * _NS_PER_MS, jitter_ns))
-    if not traffic:
-        raise ContractError(
-            f"{dbc}: no message has a cycle time (GenMsgCycleTime): there is nothing to bound"
-        )
+        traffic.append(Traffic(message.name, can_id, bits, period_ns, jitter_ns))
+    if not any(message.period_ns for message in traffic):
+        raise ContractError(f"{dbc}: no message has a cycle time (GenMsgCycleTime): nothing to bound")
     baudrate = database.dbc.attributes.get("Baudrate") if database.dbc else None
-    return traffic, left_out, int(baudrate.value) if baudrate else DEFAULT_BIT_RATE
+    return traffic, int(baudrate.value) if baudrate else DEFAULT_BIT_RATE
 
 
 def _rta(arguments: argparse.Namespace) -> int:
     if not 0.0 <= arguments.jitter < 1e6:
         raise ContractError(f"--jitter is {arguments.jitter}, must be from 0 to 1e6 µs")
-    for bit_rate in arguments.bitrate or ():
-        check_bit_rate(bit_rate)
-    traffic, left_out, nominal = cyclic_traffic(arguments.dbc, round(arguments.jitter * 1e3))
+    traffic, nominal = traffic_of(arguments.dbc, round(arguments.jitter * 1e3))
     bit_rates = arguments.bitrate or [nominal]
-    results = {bit_rate: response_times(traffic, bit_rate) for bit_rate in bit_rates}
+    for bit_rate in bit_rates:
+        check_bit_rate(bit_rate)
+    try:
+        results = {bit_rate: response_times(traffic, bit_rate) for bit_rate in bit_rates}
+    except ValueError as error:
+        raise ContractError(f"{arguments.dbc}: {error}") from error
     if arguments.json:
         print(json.dumps({str(b): _figures(traffic, b, rows) for b, rows in results.items()}, indent=2))
     else:
         for bit_rate, rows in results.items():
             Console().print(_table(traffic, bit_rate, rows))
-        if left_out:
-            print(f"left out (no cycle time, or bench channel): {', '.join(left_out)}")
-    return EXIT_OK if all(row.met for rows in results.values() for row in rows) else EXIT_MISSED
+    missed = any(row.met is False for rows in results.values() for row in rows)
+    return EXIT_MISSED if missed else EXIT_OK
 
 
 def _figures(traffic: list[Traffic], bit_rate: int, rows: list[ResponseTime]) -> dict[str, Any]:
@@ -126,7 +127,7 @@ def _table(traffic: list[Traffic], bit_rate: int, rows: list[ResponseTime]) -> T
         table.add_row(
             message.name,
             f"{message.can_id & ~EFF_FLAG:#x}",
-            *("no bound" if ns is None else f"{ns / 1e3:.0f}" for ns in times_ns),
-            "met" if row.met else "[red]missed[/red]",
+            *("-" if ns is None else f"{ns / 1e3:.0f}" for ns in times_ns),
+            _VERDICTS[row.met],
         )
     return table

@@ -161,7 +161,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import CancelledError, Client, KilledWorker
     except ImportError:
-        raise BenchError("--cluster needs Dask: pip install 'ddh-hil[cluster]'") from None
+        raise BenchError("--cluster needs Dask: pip install '.[cluster]' in the project's folder") from None
     try:
         client = Client(address, timeout=_CLUSTER_TIMEOUT_S)
     except (OSError, ValueError) as error:

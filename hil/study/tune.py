@@ -145,7 +145,10 @@ class Search:
             if getattr(getattr(start, part), name) != 0
         ]
         distinct = list(dict.fromkeys(replace(one, position_lsb_um=1) for one in self._machines))
-        self._plants = _stacked(distinct, tuple(OPERATING_POINTS))
+        try:
+            self._plants = _stacked(distinct, tuple(OPERATING_POINTS))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise BenchError(f"a machine of the box cannot hold its load ({error}): narrow it") from error
         self._nominal_plants = _stacked([Machine()], MS_POINTS)
         self._scale_mm: np.ndarray | None = None
         self.evaluations = 0

@@ -67,7 +67,8 @@ def run_command(arguments: argparse.Namespace) -> int:
         search.run(arguments.evaluations, arguments.seed, advance)
     about = (
         f"hil tune --tuning {arguments.tuning} --samples {arguments.samples} --seed {arguments.seed} "
-        f"--evaluations {arguments.evaluations} --max-ms {arguments.max_ms:g}",
+        f"--evaluations {arguments.evaluations} --max-ms {arguments.max_ms:g}"
+        + (f" --box {arguments.box}" if arguments.box else ""),
         f"{search.evaluations} candidates, cost {search.best.cost:.4f} (start {search.started.cost:.4f})",
     )
     gains_file = block_file.with_suffix(".toml")

@@ -43,7 +43,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 def bench_at(bench_at: Callable[..., Bench]) -> Callable[..., Bench]:
     """Return what makes a bench under the paper's ADRC, if nothing else is asked for.
 
-    Every tuning has its gains, so that the law can be chosen over the bus wherever the firmware runs.
+    The default tuning has its gains, too, so that it can be chosen over the bus wherever the firmware runs.
     """
     return lambda **how: bench_at(**{"controller": "adrc", **how})
 

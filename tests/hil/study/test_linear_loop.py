@@ -46,7 +46,7 @@ FILTERED = {
     "scheduled_unfiltered": Tuning(law=k.LAW_SCHEDULED, front_end=BOTH_WAYS_ALIKE, command_filter=NO_FILTER),
 }
 STROKE_OF_THE_DESIGN_M = (3e-4, 0.02, 0.1, 0.2, 0.3, 0.37)
-"""The designs' own grid ended at 0.37 m."""
+"""The first designs were judged up to 0.37 m."""
 
 
 def largest_ms(tuning, point="shut"):
@@ -229,3 +229,11 @@ def test_an_unstable_loop_has_no_finite_ms():
 def test_an_unknown_operating_point_is_refused():
     with pytest.raises(ValueError, match="point is 'open', must be one of shut, held, lowering"):
         analyse(Tuning(), 0.2, point="open")
+
+
+def test_a_plant_whose_eigenvectors_span_nothing_is_sampled_all_the_same():
+    """Without leakage the two chambers' pressures drift alike: one eigenvector too few."""
+    tight, nearly = (
+        analyse(BUILT_IN["robust"], 0.2, machine=Machine(leak=leak), point="shut") for leak in (0.0, 1e-6)
+    )
+    assert tight.spectral_radius == pytest.approx(nearly.spectral_radius, abs=1e-4)

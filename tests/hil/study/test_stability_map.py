@@ -42,7 +42,6 @@ def test_machines_that_differ_in_nothing_linear_share_their_loop():
 
 @pytest.mark.parametrize(("point", "unstable"), [("shut", 64), ("held", 152)])
 def test_the_papers_tuning_is_unstable_at_many_corners_of_the_box(point, unstable):
-    """In runs it fails at 129 of the 256, by the design's own count."""
     corners = load_box().corners()
     assert len(corners) == 256
     summary = stability_maps(PAPER, corners, point=point)["ADRC"].summary()
