@@ -4,7 +4,7 @@ READY := .venv/.ready
 
 .PHONY: run reproduce test test-long test-vcan check bench figures clean
 
-run: $(READY)  ## the main job: the 10 s sine under ADRC, three processes in lock-step
+run: $(READY)  ## the main job: the 10 s sine under the robust ADRC, three processes in lock-step
 	$(BIN)/hil run sine
 
 reproduce: $(READY)  ## the paper's evaluation over the bus: out/reproduce/report.html

@@ -54,7 +54,11 @@ def chosen_tuning(name: str | None = None, file: Path | None = None) -> ChosenTu
 
 def add_tuning_arguments(parser: argparse.ArgumentParser) -> None:
     """Add --tuning and --calibration; `tuning_of` makes them a tuning."""
-    parser.add_argument("--tuning", metavar="NAME", help=f"built-in calibration (default {DEFAULT_TUNING})")
+    parser.add_argument(
+        "--tuning",
+        metavar="NAME",
+        help=f"one of `hil list` (default {DEFAULT_TUNING})",
+    )
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="calibration block instead")
 
 

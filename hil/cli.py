@@ -19,7 +19,8 @@ from rich.table import Table
 
 from dbc.contract import ContractError
 from firmware_py.calibration import CalibrationError
-from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
+from firmware_py.chosen_tuning import DEFAULT_TUNING, add_tuning_arguments, tuning_of
+from firmware_py.tuning import TUNINGS
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
@@ -40,7 +41,7 @@ from hil.run.options import (
 from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
-from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, load_scenario
+from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, controller_of, load_scenario
 from hil.study import reproduce, rta_command, sweep_command, tune_command
 from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
@@ -141,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     reproduce.add_command(commands)
     rta_command.add_command(commands)
 
-    listing = commands.add_parser("list", help="list the built-in scenarios")
+    listing = commands.add_parser("list", help="list the built-in scenarios and tunings")
     listing.set_defaults(command=_list)
     return parser
 
@@ -302,4 +303,11 @@ def _list(_: argparse.Namespace) -> int:
         scenario = load_scenario(name)
         table.add_row(name, f"{scenario.duration_s:g}", scenario.title)
     Console().print(table)
+    tunings = Table(box=None)
+    tunings.add_column("tuning")
+    tunings.add_column("its control law")
+    for name, tuning in TUNINGS.items():
+        default = " (default)" if name == DEFAULT_TUNING else ""
+        tunings.add_row(f"{name}{default}", controller_of(tuning.law))
+    Console().print(tunings)
     return EXIT_OK

@@ -141,7 +141,7 @@ def test_a_run_under_a_calibration_file_can_be_played_again_too(tmp_path, capsys
 
 
 def test_each_failed_sample_is_printed_as_one_command(sine, tmp_path, capsys, quickly):
-    summary = swept(tmp_path, "sweep", "sine", "--samples", "30", "--seed", "4")
+    summary = swept(tmp_path, "sweep", "sine", "--samples", "30", "--seed", "4", "--tuning", "paper")
     said = capsys.readouterr().out.splitlines()
     assert [line for line in said if line.startswith("hil run")] == [e["replay"] for e in summary["failed"]]
     assert without_wall_time(tmp_path) == without_wall_time(sine)
