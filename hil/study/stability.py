@@ -42,7 +42,7 @@ _MS_SHOWN = (1.0, 4.0)
 _RADIUS_SHOWN = (0.97, 1.0)
 _TICKS_MM = (0.3, 40, 100, 200, 300, 395)
 _WIDTH_IN = 8.5
-_ROW_IN = 0.085
+_ROW_IN = 0.115
 
 
 def map_machines() -> list[Machine]:
@@ -191,6 +191,6 @@ def _panel(axes: "Axes", shown: StabilityMap, values: np.ndarray, span: tuple[fl
     axes.plot(column, row, "x", color="#d55e00", markersize=3.0)
     ticks = [int(np.argmin(np.abs(shown.positions_m - at_mm * 1e-3))) for at_mm in _TICKS_MM]
     axes.set_xticks(ticks, [f"{shown.positions_m[tick] * 1e3:g}" for tick in ticks])
-    axes.tick_params(axis="y", labelsize=5.0, length=0.0)
+    axes.tick_params(axis="y", labelsize=7.0, length=0.0)
     axes.grid(visible=False)
     return image
