@@ -1,6 +1,6 @@
-"""Reference positions and load forces as pure functions of time."""
+"""Reference positions as pure functions of time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -63,14 +63,6 @@ REFERENCES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "lift_lower": lift_lower,
     "full_stroke": full_stroke,
 }
-
-
-def load_profile(time_s: np.ndarray, steps: Sequence[tuple[float, float]]) -> np.ndarray:
-    """Return the external load in N that steps to each force at its time."""
-    load = np.zeros_like(time_s)
-    for start_s, force_n in steps:
-        load[time_s >= start_s] = force_n
-    return load
 
 
 def setpoint_counts(reference_m: np.ndarray) -> np.ndarray:

@@ -24,6 +24,11 @@ def controller_of(law: int) -> str:
     return CONTROLLERS[law - 1]
 
 
+def law_of(controller: str) -> int:
+    """Return the number on the bus of a control law by its name."""
+    return 1 + CONTROLLERS.index(controller)
+
+
 class ScenarioError(ValueError):
     """A scenario does not exist or does not make sense; the message says what to do."""
 

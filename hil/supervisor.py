@@ -12,7 +12,7 @@ from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from hil.references import setpoint_counts
-from hil.scenario import CONTROLLERS, PERIOD_S, Scenario
+from hil.scenario import CONTROLLERS, PERIOD_S, Scenario, law_of
 
 BRING_UP_PERIODS = 100
 """Periods from the supervisor's start to the first one of a scenario: the drive is enabled in them."""
@@ -85,7 +85,7 @@ class Supervisor:
         self._reference_begin = 0
         self._chunk: tuple[list[float], list[int]] = ([], [])
         self._chunk_begin = 0
-        self._words = {"enable": 0, "law": 1 + CONTROLLERS.index(controller), "fault_reset": 0, "load_n": 0}
+        self._words = {"enable": 0, "law": law_of(controller), "fault_reset": 0, "load_n": 0}
         self._plan: list[tuple[int, int, dict[str, int | Reference]]] = []
         self._planned = count()
         for enable, periods in ((0, _ARMING_PERIODS), (1, _ENABLE_PERIODS)):

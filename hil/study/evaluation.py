@@ -13,7 +13,7 @@ from firmware_py.tuning import TUNINGS
 from hil.measure import Trace, left_run, result_of, trace_of
 from hil.run.inprocess import run_inprocess
 from hil.run.options import DEFAULT_BIT_RATE, Recording, RunOptions
-from hil.scenario import CONTROLLERS, controller_of, load_scenario
+from hil.scenario import controller_of, law_of, load_scenario
 from hil.study import paper
 from hil.study.box import load_box
 from hil.study.disturbance import observer_error, true_disturbance_m_s3
@@ -64,7 +64,7 @@ class Contestant:
     @property
     def law_number(self) -> int:
         """Number of the law on the bus."""
-        return 1 + CONTROLLERS.index(self.law)
+        return law_of(self.law)
 
     @property
     def in_paper(self) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_py.chosen_tuning import ChosenTuning
 from hil.report import BLUE, GREY, RED
-from hil.scenario import CONTROLLERS, Scenario
+from hil.scenario import Scenario, law_of
 from hil.study.box import WHOLE, Box
 from hil.study.runs import FAILED_RMS_MM, FIGURES, failed
 from plant_sim.machine import Machine
@@ -62,7 +62,7 @@ class Sweep:
     @property
     def law(self) -> int:
         """Number of the control law."""
-        return 1 + CONTROLLERS.index(self.controller)
+        return law_of(self.controller)
 
     def replay(self, sample: int, scenario: int) -> str:
         """Return the command that plays one run again, over the bus."""

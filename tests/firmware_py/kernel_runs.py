@@ -11,7 +11,7 @@ from firmware_py import checked
 from firmware_py.calibration import Calibration
 from firmware_py.kernel import layout as k
 from hil.closed_loop import PERIOD_S, RAD_S_PER_COUNT, SUBSTEPS
-from hil.references import load_profile, setpoint_counts
+from hil.references import setpoint_counts
 from hil.scenario import load_scenario
 from plant_sim.equilibrium import initial_state
 from plant_sim.integrator import advance
@@ -32,8 +32,7 @@ class Case:
 
 def make_case(name: str) -> Case:
     scenario = load_scenario(name)
-    time_s = np.arange(scenario.periods) * PERIOD_S
-    return Case(setpoint_counts(scenario.reference_m()), load_profile(time_s, scenario.load))
+    return Case(setpoint_counts(scenario.reference_m()), scenario.load_n())
 
 
 CASES = {name: make_case(name) for name in ("sine", "sine_load", "lift_lower", "lift_lower_load")}

@@ -39,12 +39,11 @@ def test_full_stroke_moves_smoothly_between_its_stations():
 
 
 def test_loads_step_at_their_times():
-    time_s = np.arange(10_000) * PERIOD_S
-    assert not references.load_profile(time_s, load_scenario("sine").load).any()
-    load_n = references.load_profile(time_s, load_scenario("sine_load").load)
+    assert not load_scenario("sine").load_n().any()
+    load_n = load_scenario("sine_load").load_n()
     assert load_n[2999] == 0.0
     assert load_n[3000] == -2000.0
-    assert references.load_profile(time_s, load_scenario("full_stroke").load)[7200] == -1500.0
+    assert load_scenario("full_stroke").load_n()[7200] == -1500.0
 
 
 def test_setpoints_are_rounded_to_a_tenth_of_a_micrometre():

@@ -37,12 +37,12 @@ from firmware_py.kernel import layout as k
 from firmware_py.tuning import Tuning
 from hil.bus.wire import Clock
 from hil.closed_loop import run_closed_loop
-from hil.references import load_profile, setpoint_counts
+from hil.references import setpoint_counts
 from hil.run.inprocess import run_inprocess
 from hil.run.lockstep import run_lockstep
 from hil.run.options import HUB_GREETING, RunOptions
 from hil.run.realtime import SPIN_NS, TICK_MARGIN_NS, RealtimeNode, fifo_scheduling
-from hil.scenario import PERIOD_S, Scenario, load_scenario
+from hil.scenario import Scenario, load_scenario
 
 PYTHON_LOOP = 1_000_000
 LATENESS_PERIODS = 2000
@@ -66,8 +66,7 @@ def bus_run(run: Callable[[RunOptions], object], scenario: Scenario) -> float:
 
 def jitted_loop(scenario: Scenario) -> float:
     """Return multiples of real time of kernel and plant in one jitted loop, without the bus."""
-    time_s = np.arange(scenario.periods) * PERIOD_S
-    setpoints, load_n = setpoint_counts(scenario.reference_m()), load_profile(time_s, scenario.load)
+    setpoints, load_n = setpoint_counts(scenario.reference_m()), scenario.load_n()
     calibration = Tuning().calibration()
     begin_s = time.perf_counter()
     run_closed_loop(calibration, setpoints, load_n)

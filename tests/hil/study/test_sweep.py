@@ -347,7 +347,7 @@ def test_a_cluster_that_would_not_compute_the_same_is_refused(capsys, tmp_path, 
 
 def test_without_dask_the_cluster_option_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(BenchError, match=r"pip install 'ddh-hil\[cluster\]'"), dask_cluster("tcp://x"):
+    with pytest.raises(BenchError, match=r"pip install '\.\[cluster\]'"), dask_cluster("tcp://x"):
         pass
 
 
