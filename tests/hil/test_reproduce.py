@@ -52,7 +52,7 @@ PICTURES = {f"figure_{number}" for number in ("3b", 5, 6, 7, 8)} | {
 def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of an evaluation, into which others had put something, and what it printed."""
     folder = tmp_path_factory.mktemp("out")
-    for name in ("figure_4.svg", "report.html", "notes.txt"):
+    for name in ("report.html", "notes.txt"):
         (folder / name).write_text("old")
     printed = StringIO()
     with redirect_stdout(printed):

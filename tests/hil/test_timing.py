@@ -484,7 +484,7 @@ def test_limits_that_are_met_are_in_the_result(tmp_path, capsys):
 
 def test_limits_that_are_missed_are_an_exit_code_and_one_line(tmp_path, capsys):
     file = scenario_file(tmp_path, "[timing]\nlatency_us = 500\n")
-    assert cli.main(["run", file, *RUN, str(tmp_path / "out")]) == 1
+    assert cli.main(["run", file, "--controller", "adrc", *RUN, str(tmp_path / "out")]) == 1
     said = capsys.readouterr()
     (line,) = said.err.splitlines()
     assert line.startswith(
