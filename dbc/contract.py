@@ -88,21 +88,32 @@ class Contract:
         ContractError
             The file is unreadable, not a valid DBC, or lacks something the code relies on.
         """
-        # 0.2 s, paid only where a file is loaded
-        from cantools.database import Database, load_file
-        from cantools.database.errors import Error
-
         path = path or PACKAGED_DBC
-        try:
-            database = load_file(path, database_format="dbc")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ContractError(f"{path}: cannot be read ({error}): check the path") from error
-        except Error as error:
-            reason = " ".join(str(error).split())
-            remedy = "correct it or use the packaged ddh.dbc"
-            raise ContractError(f"{path}: not a valid DBC ({reason}): {remedy}") from error
-        assert isinstance(database, Database)
-        return cls(path, database)
+        return cls(path, read_database(path))
+
+
+def read_database(path: Path) -> "Database":
+    """Parse a DBC file, ours or any other.
+
+    Raises
+    ------
+    ContractError
+        The file is unreadable or not a valid DBC.
+    """
+    # 0.2 s, paid only where a file is loaded
+    from cantools.database import Database, load_file
+    from cantools.database.errors import Error
+
+    try:
+        database = load_file(path, database_format="dbc")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ContractError(f"{path}: cannot be read ({error}): check the path") from error
+    except Error as error:
+        reason = " ".join(str(error).split())
+        remedy = "correct it or use the packaged ddh.dbc"
+        raise ContractError(f"{path}: not a valid DBC ({reason}): {remedy}") from error
+    assert isinstance(database, Database)
+    return database
 
 
 class _Reader:

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from dbc.contract import PACKAGED_DBC, ContractError
+from dbc.contract import MAX_CLASSIC_DLC, NS_PER_MS, PACKAGED_DBC, ContractError, read_database
 from dbc.frame import EFF_FLAG
 from hil.bus.wire_time import worst_case_bits
 from hil.run.options import DEFAULT_BIT_RATE, check_bit_rate
@@ -17,8 +17,6 @@ from hil.study.response_time import ResponseTime, Traffic, load, response_times
 
 EXIT_OK, EXIT_MISSED = range(2)
 _VERDICTS = {True: "met", False: "[red]missed[/red]", None: "no deadline"}
-_NS_PER_MS = 1_000_000
-_MAX_CLASSIC_DLC = 8
 
 
 def add_command(commands: Any) -> None:
@@ -58,24 +56,16 @@ def traffic_of(dbc: Path, jitter_ns: int = 0) -> tuple[list[Traffic], int]:
     ContractError
         If the file is unreadable, has no cyclic message, or one that is no classic CAN frame.
     """
-    from cantools.database import Database, load_file
-    from cantools.database.errors import Error
-
-    try:
-        database = load_file(dbc, database_format="dbc")
-    except (OSError, UnicodeDecodeError, Error) as error:
-        reason = " ".join(str(error).split())
-        raise ContractError(f"{dbc}: cannot be read ({reason}): check the path and the file") from error
-    assert isinstance(database, Database)
+    database = read_database(dbc)
     traffic = []
     for message in database.messages:
         attributes = message.dbc.attributes if message.dbc else {}
         if "BenchChannel" in attributes and attributes["BenchChannel"].value:
             continue
-        if message.is_fd or message.length > _MAX_CLASSIC_DLC:
+        if message.is_fd or message.length > MAX_CLASSIC_DLC:
             raise ContractError(f"{dbc}: {message.name} is no classic CAN frame: the analysis is for those")
         can_id = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-        period_ns = message.cycle_time * _NS_PER_MS if message.cycle_time else None
+        period_ns = message.cycle_time * NS_PER_MS if message.cycle_time else None
         bits = worst_case_bits(can_id, message.length)
         traffic.append(Traffic(message.name, can_id, bits, period_ns, jitter_ns))
     if not any(message.period_ns for message in traffic):
