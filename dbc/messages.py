@@ -137,11 +137,44 @@ class BenchCommand(IntEnum):
     SCALE_PARAMETER = 3
 
 
+class BenchFault(IntEnum):
+    """Faults that a SET_FAULT switches on; the value is in 1e-6 of the unit given here, 0 switches it off."""
+
+    NONE = 0
+    """Switches all faults off, whatever the value."""
+    SENSOR_STUCK = 1
+    """On: the position last reported is reported again and again; counter and CRC go on."""
+    SENSOR_BIAS = 2
+    """m, added to the position measured."""
+    SENSOR_DRIFT = 3
+    """m/s, from when it is switched on; what has drifted away is gone when it is switched off."""
+    SENSOR_NOISE = 4
+    """m RMS, white, beside the noise that the sensor has by itself."""
+    SENSOR_DROPOUT = 5
+    """On: no PositionFeedback is sent, and its counter rests."""
+    SENSOR_STATUS = 6
+    """The SensorStatus reported, as a number."""
+
+
+class BenchParameter(IntEnum):
+    """Parameters that a SCALE_PARAMETER multiplies; the value is a factor on the machine as built, 1e-6."""
+
+    BULK_MODULUS = 1
+    EFFICIENCY = 2
+    LEAK = 3
+    PRECHARGE = 4
+    RELIEF_CRACK = 5
+    """Of both valves; 0: stuck open."""
+    MOTOR_SPEED = 6
+    MOTOR_ACCELERATION = 7
+    MASS = 8
+
+
 class BenchControl(NamedTuple):
     """Bench to the nodes under test; `command` says what `identifier` and `value` mean.
 
-    1 reset: value is the initial position in 0.1 µm. 2 fault: identifier, magnitude in 1e-6 of its SI unit.
-    3 parameter: identifier, factor on the nominal value in 1e-6.
+    1 reset: value is the initial position in 0.1 µm. 2 fault: identifier of `BenchFault`, magnitude in 1e-6
+    of its unit. 3 parameter: identifier of `BenchParameter`, factor on the machine as built in 1e-6.
     """
 
     command: Annotated[int, Raw(8)]

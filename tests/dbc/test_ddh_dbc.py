@@ -3,7 +3,9 @@
 import cantools
 import pytest
 
+from dbc.codec import signal_name
 from dbc.contract import PACKAGED_DBC
+from dbc.messages import BenchCommand, BenchFault, BenchParameter
 
 DATABASE = cantools.database.load_file(PACKAGED_DBC, strict=True)
 MESSAGES = {message.name: message for message in DATABASE.messages}
@@ -128,6 +130,31 @@ def test_states_have_names():
         2: "Run",
         3: "Safe",
     }
+
+
+@pytest.mark.parametrize(
+    ("signal", "members"),
+    [("Command", BenchCommand), ("FaultId", BenchFault), ("ParameterId", BenchParameter)],
+)
+def test_tools_outside_name_what_the_bench_asks_for_as_the_code_does(signal, members):
+    assert dict(MESSAGES["BenchControl"].get_signal_by_name(signal).choices) == {
+        member.value: signal_name(member.name.lower()) for member in members
+    }
+
+
+@pytest.mark.parametrize(
+    ("typed", "meaning"),
+    [
+        ("0200020040420F00", {"Command": "SetFault", "FaultId": "SensorBias", "FaultValue": 1.0}),
+        (
+            "0300010020A10700",
+            {"Command": "ScaleParameter", "ParameterId": "BulkModulus", "ParameterScale": 0.5},
+        ),
+    ],
+)
+def test_a_fault_can_be_typed_by_hand(typed, meaning):
+    """``cansend can0 1FFF0001#0300010020A10700`` halves the oil's stiffness."""
+    assert MESSAGES["BenchControl"].decode(bytes.fromhex(typed)) == meaning
 
 
 @pytest.mark.parametrize(
