@@ -288,6 +288,53 @@ class Wire:
         noise = self.now_ns + duration_ns, round(bit_error_rate * 1e9), seed
         self._core[[at.NOISE_UNTIL, at.NOISE_LEVEL, at.NOISE_STATE]] = noise
 
+    def babble(self, frame: Frame, gap_ns: int, duration_ns: int) -> None:
+        """Let a faulty sender that is no node send a frame again and again, from now on.
+
+        It keeps the rules of arbitration, so the identifier says whom it holds up. Faults of `spoil` but
+        `DESTROY` do not touch it.
+
+        Parameters
+        ----------
+        frame : Frame
+            What it sends.
+        gap_ns : int
+            From the end of one frame's intermission to the next frame; 0 leaves no room for lower priorities.
+        duration_ns : int
+            How long; a frame that is waiting or under way at the end is still sent.
+
+        Raises
+        ------
+        ValueError
+            If one of them is not as said, or the wire has a babbling sender already.
+        """
+        if gap_ns < 0:
+            raise ValueError(f"a gap is 0 ns or more, not {gap_ns}")
+        if duration_ns <= 0:
+            raise ValueError(f"babbling takes time, not {duration_ns} ns")
+        under_way = self._core[at.END] != NEVER and self._core[at.ON_WIRE_SENDER] == at.BABBLER
+        if self.now_ns < self._core[at.BABBLE_UNTIL] or under_way or self.waiting(at.BABBLER):
+            raise ValueError("one sender is babbling already: wait until it ends")
+        self._core[[at.BABBLE_GAP, at.BABBLE_UNTIL]] = gap_ns, self.now_ns + duration_ns
+        self._make_room()
+        at.enqueue(self._core, self._queue, at.BABBLER, frame.can_id | frame.dlc << 32, _signed(frame.data))
+
+    def force_bus_off(self, port: Port) -> None:
+        """Take a node's CAN controller off the bus now, as 32 destroyed frames would.
+
+        What the node had queued is gone; a frame of its under way still ends. It recovers after 128 sequences
+        of 11 recessive bits from now, and until then neither hears nor sends.
+        """
+        at.let_recover(self._core, self._port_words)
+        if not self._core[at.BUS_OFF]:  # else idle bits are counted already
+            self._core[[at.BUS_OFF, at.COUNTED_UNTIL]] = True, self.now_ns
+        words = self._port_words[port.order]
+        words[[confinement.TEC, confinement.SEQUENCES_LEFT]] = (
+            confinement.BUS_OFF_FROM,
+            confinement.RECOVERY_SEQUENCES,
+        )
+        self.withdraw(port.order)
+
     def error_state(self, port: Port) -> ErrorState:
         """Return what fault confinement says of a node now."""
         at.let_recover(self._core, self._port_words)

@@ -58,10 +58,15 @@ _ID_MASK = 0xFFFF_FFFF
     NOISE_UNTIL,  # end of the noise, ns
     NOISE_LEVEL,  # probability that a bit is bad, per billion
     NOISE_STATE,  # of its random numbers
-) = range(21)
-CORE_SIZE = 21
+    BABBLE_GAP,  # from the end of a babbled frame's intermission to the next frame, ns
+    BABBLE_UNTIL,  # bus time from which no further one is handed over, ns
+) = range(23)
+CORE_SIZE = 23
 
 MAX_PORTS = 48
+BABBLER = 1 << 30
+"""The babbling sender, which is no node: it has no error counters, and of equal identifiers it loses."""
+
 WAKE, PHASE, DRIFT_PPB, MAILED, LINK, EXCHANGES = range(6)  # then those of `hil.bus.confinement`
 PORT_SIZE = 10
 NO_LINK = -1
@@ -250,6 +255,17 @@ def _arbitrate(core, ports, queue, faults):  # type: ignore[no-untyped-def]
 
 
 @register_jitable
+def _enqueue(core, queue, ready_ns, sender, head, data):  # type: ignore[no-untyped-def]
+    """Let a frame take part in arbitration from `ready_ns` on."""
+    row = queue[core[QUEUED]]
+    row[READY], row[SENDER], row[ORDER], row[HEAD], row[DATA] = ready_ns, sender, core[SEQUENCE], head, data
+    row[KEY] = arbitration_key(head & _ID_MASK)
+    row[OUT_OF_BAND] = 0
+    core[QUEUED] += 1
+    core[SEQUENCE] += 1
+
+
+@register_jitable
 def _withdraw(core, queue, sender):  # type: ignore[no-untyped-def]
     """Forget what a sender has handed over and that has not begun."""
     kept = 0
@@ -278,11 +294,8 @@ def _destroyed(core, ports, queue, log):  # type: ignore[no-untyped-def]
     if is_off:
         _withdraw(core, queue, sender)
         return
-    again = queue[core[QUEUED]]
-    again[READY], again[KEY], again[SENDER] = core[ON_WIRE_READY], arbitration_key(head & _ID_MASK), sender
-    again[ORDER], again[HEAD], again[DATA] = core[ON_WIRE_ORDER], head, core[ON_WIRE_DATA]
-    again[OUT_OF_BAND] = 0
-    core[QUEUED] += 1
+    _enqueue(core, queue, core[ON_WIRE_READY], sender, head, core[ON_WIRE_DATA])
+    queue[core[QUEUED] - 1, ORDER] = core[ON_WIRE_ORDER]
 
 
 @register_jitable
@@ -296,6 +309,10 @@ def _ended(core, ports, filters, queue, log, mail):  # type: ignore[no-untyped-d
     else:
         after_success(ports, core[PORTS], sender)
         _deliver(core, ports, filters, log, mail, core[ON_WIRE_HEAD], core[ON_WIRE_DATA], sender)
+        if sender == BABBLER and core[IDLE] + core[BABBLE_GAP] < core[BABBLE_UNTIL]:
+            _enqueue(
+                core, queue, core[IDLE] + core[BABBLE_GAP], sender, core[ON_WIRE_HEAD], core[ON_WIRE_DATA]
+            )
     if sender < core[PORTS] and is_passive(ports[sender]):
         ports[sender, SUSPENDED_UNTIL] = core[IDLE] + _bits_ns(core, SUSPEND_BITS)
 
@@ -318,6 +335,12 @@ def _next(core, ports, queue):  # type: ignore[no-untyped-def]
     if core[END] == NEVER and ready_ns < NEVER:
         arbitration_ns = max(core[IDLE], core[NOW], ready_ns)
     return port, wake_ns, entry, band_ns, arbitration_ns
+
+
+@njit("void(int64[::1], int64[:,::1], int64, int64, int64)", depends=("dbc.frame",))
+def enqueue(core, queue, sender, head, data):  # type: ignore[no-untyped-def]
+    """Let a frame take part in arbitration from now on, untouched by the faults of `hand_over`."""
+    _enqueue(core, queue, core[NOW], sender, head, data)
 
 
 @njit("void(int64[::1], int64[:,::1])", depends=("hil.bus.confinement",))
@@ -353,16 +376,8 @@ def _hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, 
             ready_ns += fault[FAULT_ARGUMENT]
         elif fault[FAULT_KIND] == REPEAT:
             data = fault[FAULT_ARGUMENT]
-    row = queue[core[QUEUED]]
-    row[READY] = max(ready_ns, core[NOW])
-    row[KEY] = arbitration_key(can_id)
-    row[SENDER] = sender
-    row[ORDER] = core[SEQUENCE]
-    row[HEAD] = head
-    row[DATA] = data
-    row[OUT_OF_BAND] = can_id in out_of_band
-    core[QUEUED] += 1
-    core[SEQUENCE] += 1
+    _enqueue(core, queue, max(ready_ns, core[NOW]), sender, head, data)
+    queue[core[QUEUED] - 1, OUT_OF_BAND] = can_id in out_of_band
 
 
 @register_jitable

@@ -64,7 +64,7 @@ class Bus:
 
     def events(self) -> list[tuple[int, str]]:
         """Return the ends of frames in bit times, and what they were."""
-        names = {HIGH.can_id: "high", LOW.can_id: "low"}
+        names = {HIGH.can_id: "high", LOW.can_id: "low", FIRST.can_id: "first"}
         return [
             (int(time_ns) // BIT_NS, "error" if int(can_id) & ERR_FLAG else names[int(can_id)])
             for time_ns, can_id, _, _ in self.wire.traffic
@@ -207,6 +207,101 @@ def test_power_on_clears_the_counters(bus):
     destroy(bus, 32)
     bus.wire.start(bus.ports[0])
     assert bus.state(0) == type(bus.state(0))("error-active", 0, 0)
+
+
+def test_a_node_forced_bus_off_is_silent_and_deaf_for_128_times_11_recessive_bits(bus):
+    bus.wire.run(5_000 * BIT_NS)  # idle bits before do not count
+    bus.wire.force_bus_off(bus.ports[0])
+    assert (bus.state(0).name, bus.state(0).tec, bus.state(1).name) == ("bus-off", 256, "error-active")
+    bus.send(0, HIGH, bus.wire.now_ns)
+    bus.wire.run((5_000 + 128 * 11) * BIT_NS - 1)
+    assert bus.state(0).name == "bus-off"
+    bus.wire.run((5_000 + 128 * 11) * BIT_NS)
+    assert bus.state(0) == type(bus.state(0))("error-active", 0, 0)
+    assert bus.events() == []
+    bus.send(0, HIGH, bus.wire.now_ns)
+    bus.wire.run(10**8)
+    assert [what for _, what in bus.events()] == ["high"]
+
+
+def test_a_node_forced_bus_off_finishes_its_frame_loses_its_queue_and_hears_nothing(bus):
+    bus.send(0, HIGH)
+    bus.send(0, HIGH)
+    bus.send(1, LOW)
+    bus.wire.run(10 * BIT_NS)
+    bus.wire.force_bus_off(bus.ports[0])
+    bus.wire.run((HIGH_BITS + LOW_BITS) * BIT_NS)
+    assert [what for _, what in bus.events()] == ["high", "low"]
+    assert bus.nodes[0].heard == []
+    assert bus.state(0).name == "bus-off"
+
+
+# a babbling sender
+
+FIRST = Frame(0x000, 1, 0x55)
+FIRST_BITS = classic_bits(*FIRST)
+
+
+def babbling(bus) -> list[int]:
+    """Return the ends of babbled frames in bit times."""
+    return [int(time_ns) // BIT_NS for time_ns, can_id, _, _ in bus.wire.traffic if can_id == FIRST.can_id]
+
+
+def test_a_babbling_sender_without_gaps_holds_everybody_up(bus):
+    bus.wire.babble(FIRST, 0, 100 * FIRST_BITS * BIT_NS)
+    bus.send(0, HIGH)
+    bus.wire.run(10**8)
+    assert babbling(bus) == [number * FIRST_BITS - IFS_BITS for number in range(1, 101)]
+    assert int(bus.wire.traffic[-1, 0]) == (100 * FIRST_BITS + HIGH_BITS - IFS_BITS) * BIT_NS
+    assert len(bus.nodes[0].heard) == len(bus.nodes[1].heard) - 1 == 100
+
+
+def test_a_babbling_sender_leaves_its_gap_to_others(bus):
+    bus.wire.babble(FIRST, LOW_BITS * BIT_NS, 10 * (FIRST_BITS + LOW_BITS) * BIT_NS)
+    for _ in range(20):
+        bus.send(0, LOW)
+    bus.wire.run(9 * (FIRST_BITS + LOW_BITS) * BIT_NS)
+    period = FIRST_BITS + LOW_BITS
+    assert babbling(bus) == [number * period + FIRST_BITS - IFS_BITS for number in range(9)]
+    assert len(bus.wire.log) == 18, "one low frame fits into each gap"
+
+
+def test_a_babbling_sender_takes_part_in_arbitration(bus):
+    last = Frame(0x7FF, 0, 0)
+    bus.wire.babble(last, 0, 10**6)
+    bus.send(0, HIGH)
+    bus.send(1, LOW)
+    bus.wire.run(1)
+    bus.wire.run(10**7)
+    heard = [int(can_id) for _, can_id, _, _ in bus.wire.traffic]
+    assert heard[:3] == [HIGH.can_id, LOW.can_id, last.can_id]
+
+
+def test_a_destroyed_frame_of_a_babbling_sender_is_repeated_and_it_never_goes_bus_off(bus):
+    bus.wire.spoil(FIRST.can_id, FrameFault.DESTROY, 5, 40)
+    bus.wire.babble(FIRST, 0, 10**6)
+    bus.wire.run(10**8)
+    errors = int(np.count_nonzero(bus.wire.traffic[:, 1].astype(int) & ERR_FLAG))
+    assert errors == 40
+    assert len(babbling(bus)) > 0
+    assert bus.counters()[0][0] == 0
+
+
+def test_one_sender_babbles_at_a_time(bus):
+    bus.wire.babble(FIRST, 0, 1)
+    bus.wire.run(10 * BIT_NS)
+    with pytest.raises(ValueError, match="babbling already"):
+        bus.wire.babble(LOW, 0, 1)
+    bus.wire.run(FIRST_BITS * BIT_NS)
+    bus.wire.babble(LOW, 0, 1)
+    bus.wire.run(10**6)
+    assert [what for _, what in bus.events()[1:]] == ["low"]
+
+
+@pytest.mark.parametrize(("gap_ns", "duration_ns"), [(-1, 1), (0, 0), (0, -1)])
+def test_babbling_that_is_none_is_refused(bus, gap_ns, duration_ns):
+    with pytest.raises(ValueError, match=r"a gap is|babbling takes time"):
+        bus.wire.babble(FIRST, gap_ns, duration_ns)
 
 
 # noise
