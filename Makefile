@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run reproduce test test-long test-vcan check bench figures clean
+.PHONY: run reproduce test test-long test-vcan check bench figures c clean
 
 run: $(READY)  ## the main job: the 10 s sine under the robust ADRC, three processes in lock-step
 	$(BIN)/hil run sine
@@ -32,6 +32,9 @@ bench: $(READY)  ## speed figures, measured side by side
 
 figures: $(READY)  ## rewrite the figures in README from a new evaluation
 	$(BIN)/python tests/tools/readme_figures.py --write
+
+c: $(READY)  ## rewrite the exported C in firmware_py/c
+	$(BIN)/python -m firmware_py.c_export firmware_py/c
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

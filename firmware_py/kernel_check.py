@@ -54,6 +54,8 @@ class Module:
     tree: ast.Module
     constants: dict[str, int] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
+    kinds: dict[ast.expr, Kind] = field(default_factory=dict)
+    """Kind of each expression and of each assigned name in the functions' bodies."""
 
 
 class Violation(Exception):  # noqa: N818
@@ -87,12 +89,17 @@ def check(sources: Mapping[str, tuple[str, str]]) -> list[str]:
     list of str
         One line for each violation: ``path:line: message``.
     """
+    return analyse(sources)[1]
+
+
+def analyse(sources: Mapping[str, tuple[str, str]]) -> tuple[dict[str, Module], list[str]]:
+    """Check kernel modules as `check` does; return also what is known of each by its short name."""
     modules = {name: _declared(path, ast.parse(source)) for name, (path, source) in sources.items()}
     violations = []
     for name, module in modules.items():
         for line in _ModuleChecker(module, modules).violations(bodies=name != MACHINE):
             violations.append(f"{module.path}:{line}")
-    return violations
+    return modules, violations
 
 
 def _declared(path: str, tree: ast.Module) -> Module:
@@ -150,7 +157,8 @@ class _ModuleChecker:
         if bodies:
             for node in self.module.tree.body:
                 if isinstance(node, ast.FunctionDef):
-                    yield from _FunctionChecker(self.constants, self.functions).violations(node)
+                    checker = _FunctionChecker(self.constants, self.functions, self.module.kinds)
+                    yield from checker.violations(node)
 
     def _import(self, node: ast.ImportFrom) -> None:
         package, _, name = (node.module or "").rpartition(".")
@@ -184,11 +192,20 @@ def _is_docstring(node: ast.stmt) -> bool:
 
 
 class _FunctionChecker:
-    """Walks one function; `variables` holds the kinds of its names, `positive` the divisors known > 0."""
+    """Walks one function; `variables` holds the kinds of its names, `positive` the divisors known > 0.
 
-    def __init__(self, constants: Mapping[str, int], functions: Mapping[str, Signature]) -> None:
+    What it finds out of expressions and assigned names goes to `kinds`.
+    """
+
+    def __init__(
+        self,
+        constants: Mapping[str, int],
+        functions: Mapping[str, Signature],
+        kinds: dict[ast.expr, Kind],
+    ) -> None:
         self.constants = constants
         self.functions = functions
+        self.kinds = kinds
         self.variables: dict[str, Kind] = {}
         self.positive: set[str] = set()
         self.result: Kind = None
@@ -240,6 +257,7 @@ class _FunctionChecker:
         known = self.variables.setdefault(target.id, 32 if kind == "literal" else kind)
         if kind not in (known, "literal"):
             raise Violation(target, f"width of {target.id} changes from {known} to {kind}")
+        self.kinds[target] = known
         self.positive.discard(target.id)
 
     def _return(self, value: ast.expr) -> None:
@@ -268,7 +286,7 @@ class _FunctionChecker:
             ):
                 if any(self._kind(bound) != "literal" for bound in bounds):
                     raise Violation(node, "the bounds of a for are constants")
-                self.variables[name] = 32
+                self.kinds[node.target] = self.variables[name] = 32
                 self.positive = set()
                 yield from self._block(node.body)
             case _:
@@ -288,6 +306,10 @@ class _FunctionChecker:
         return kind
 
     def _kind(self, node: ast.expr) -> Kind:
+        kind = self.kinds[node] = self._kind_of(node)
+        return kind
+
+    def _kind_of(self, node: ast.expr) -> Kind:
         match node:
             case ast.Constant(value=float()):
                 raise Violation(node, f"float literal {ast.unparse(node)}")
