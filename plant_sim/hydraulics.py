@@ -46,7 +46,7 @@ def chamber_inflow(pressure, pump_flow, pump_loss, line_pressure, p):  # type: i
     offset = pump_flow
     slope = -p[at.LEAK]
     low = -np.inf
-    high = p[at.RELIEF_CRACK]
+    high = np.inf
     loss_pressure = p[at.PUMP_LOSS_PRESSURE]
     if excess > loss_pressure:
         offset -= pump_loss
@@ -57,7 +57,7 @@ def chamber_inflow(pressure, pump_flow, pump_loss, line_pressure, p):  # type: i
     else:
         slope -= pump_loss / loss_pressure
         low = -loss_pressure
-        high = min(high, loss_pressure)
+        high = loss_pressure
     suction = -p[at.CHECK_CRACK]
     if excess < suction:
         offset += p[at.CHECK_GAIN] * suction
@@ -69,8 +69,9 @@ def chamber_inflow(pressure, pump_flow, pump_loss, line_pressure, p):  # type: i
     if excess > relief:
         offset += p[at.RELIEF_GAIN] * relief
         slope -= p[at.RELIEF_GAIN]
-        low = relief
-        high = np.inf
+        low = max(low, relief)
+    else:
+        high = min(high, relief)
     return offset, slope, low, high
 
 

@@ -9,7 +9,7 @@ from dbc import e2e
 from dbc.contract import Contract
 from dbc.frame import Frame
 from dbc.jit import entry_point
-from dbc.messages import BenchCommand
+from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.record import Record
 from plant_sim.drive import COUNTS_PER_RPM, Drive
@@ -31,7 +31,9 @@ _STATUS_PHASE = 2
 _PRESSURE_PHASE = 4
 _COUNTS_PER_RAD_S = 30.0 * COUNTS_PER_RPM / math.pi
 _RESET_LSB_M = 1e-7
+_COUNTS_PER_UNIT = 1e6
 _MAX_LOAD_N = 1e6
+_FAULTS, _PARAMETERS = frozenset(BenchFault), frozenset(BenchParameter)
 _run_period = entry_point(run_period)
 
 
@@ -40,6 +42,13 @@ class Plant:
 
     At each timer call the plant is brought up to now, the position is sampled and sent, and the drive takes
     the newest DriveCommand and holds it for one period.
+
+    What the bench asked for since the last call is done then too, in the order in which it was heard: a load
+    has acted since that call, a sensor's fault is in the sample now taken, a scaled parameter acts from now
+    on. Scales are those of the machine as built, clipped to the bounds of `plant_sim.parameters`; state stays
+    what it is, so nothing jumps but what follows from it at once (the accumulator holds its oil under the new
+    precharge). The drive knows nothing of a motor that lost speed or acceleration. A reset puts back the
+    machine as built, without faults.
 
     Parameters
     ----------
@@ -69,7 +78,6 @@ class Plant:
     ) -> None:
         self._contract = contract
         self._parameters = parameters
-        self._vector = parameters.vector()
         self._sensor = sensor or PositionSensor()
         self._delay_periods = delay_periods
         self.accepts = frozenset(
@@ -95,32 +103,33 @@ class Plant:
         self._feedback_counter = np.zeros(1, np.int64)
         self._protect_status = contract.drive_status.protector().protect
         self._command_frame: Frame | None = None
-        self._bench_frames: dict[int, Frame] = {}
+        self._bench_frames: list[Frame] = []
         self._time_ns = next_period(now_ns)
-        self._sensor.restart()
         self._restart(0.0)
         return Actions(self._time_ns)
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
-        """Latch: the newest frame of each id."""
+        """Latch: the newest command, and all that the bench asks for."""
         if frame.can_id == self._command_id:
             self._command_frame = frame
         else:
-            self._bench_frames[frame.can_id] = frame
+            self._bench_frames.append(frame)
         return NOTHING
 
     def on_timer(self, now_ns: int) -> Actions:
         """Simulate up to now, send what the sensors say, and let the drive take its command."""
-        if self._bench_frames:
-            self._take_bench_frames()
+        is_rescaled = self._take_bench_frames(now_ns) if self._bench_frames else False
         periods = (now_ns - self._time_ns) // PERIOD_NS
         self._time_ns += periods * PERIOD_NS
         frame, self._command_frame = self._command_frame, None
         arrived = frame is not None and frame.dlc == self._command_dlc
         data = frame.data if frame is not None else 0
-        payload = self._run_period(periods, data, arrived, self._sensor.noise_m())
+        payload = self._run_period(periods, data, arrived, self._sensor.error_m(now_ns))
         self.record.append_array(self._row)
-        sends = [(now_ns, self._feedback.frame(payload))]
+        if is_rescaled:
+            scales = {parameter.name.lower(): factor for parameter, factor in self._scales.items()}
+            self._vector[:] = self._parameters.scaled_within_bounds(**scales).vector()
+        sends = [] if self._sensor.is_silent else [(now_ns, self._feedback.frame(payload))]
         phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
         if phase == _STATUS_PHASE:
             sends.append((now_ns, self._status_frame()))
@@ -139,8 +148,11 @@ class Plant:
         return pressure.frame(pressure.pack(*map(pressure_count, pressures_pa)))
 
     def _restart(self, position_m: float) -> None:
-        self._state = initial_state(self._parameters, position_m)
         parameters = self._parameters
+        self._state = initial_state(parameters, position_m)
+        self._vector = parameters.vector()
+        self._scales: dict[BenchParameter, float] = {}
+        self._sensor.restart()
         self._drive = Drive(
             parameters.motor_speed_rpm, parameters.motor_acceleration_rad_s2, self._delay_periods
         )
@@ -156,19 +168,28 @@ class Plant:
             self._command_layout,
             self._feedback_counter,
             self._feedback_layout,
-            self._sensor.lsb_um,
+            self._sensor.words,
         )
 
-    def _take_bench_frames(self) -> None:
-        contract = self._contract
-        frame = self._bench_frames.pop(contract.bench_control.can_id, None)
-        if frame is not None:
-            control = contract.bench_control.unpack(frame.data)
-            if control.command == BenchCommand.RESET:
-                position_m = control.value * _RESET_LSB_M
+    def _take_bench_frames(self, now_ns: int) -> bool:
+        """Do what the bench asked for; return whether a parameter is to be scaled after this period."""
+        control, load = self._contract.bench_control, self._contract.bench_load
+        is_rescaled = False
+        for frame in self._bench_frames:
+            if frame.can_id == load.can_id:
+                force_n = float(load.unpack(frame.data).force)
+                self._row[LOAD] = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
+                self.record.amend("load_n", self._row[LOAD])  # it acts in all of the period that now ends
+                continue
+            asked = control.unpack(frame.data)
+            if asked.command == BenchCommand.RESET:
+                position_m = asked.value * _RESET_LSB_M
                 self._restart(min(max(position_m, 0.0), self._parameters.stroke_m))
-        frame = self._bench_frames.pop(contract.bench_load.can_id, None)
-        if frame is not None:
-            force_n = float(contract.bench_load.unpack(frame.data).force)
-            self._row[LOAD] = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
-            self.record.amend("load_n", self._row[LOAD])  # it acts in all of the period that now ends
+                is_rescaled = False
+            elif asked.command == BenchCommand.SET_FAULT and asked.identifier in _FAULTS:
+                self._sensor.set_fault(BenchFault(asked.identifier), asked.value / _COUNTS_PER_UNIT, now_ns)
+            elif asked.command == BenchCommand.SCALE_PARAMETER and asked.identifier in _PARAMETERS:
+                self._scales[BenchParameter(asked.identifier)] = asked.value / _COUNTS_PER_UNIT
+                is_rescaled = True
+        self._bench_frames.clear()
+        return is_rescaled

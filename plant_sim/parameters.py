@@ -1,6 +1,7 @@
 """The machine's parameters: values, units, sources and bounds, checked at construction."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from numbers import Real
@@ -41,8 +42,11 @@ _SCALED_FIELDS = {
     "bulk_modulus": ("bulk_modulus_pa",),
     "efficiency": ("volumetric_efficiency",),
     "leak": ("leak_m3_per_s_pa",),
+    "precharge": ("accumulator_precharge_pa",),
+    "relief_crack": ("relief_valve_crack_pa",),
     "motor_time_constant": ("motor_time_constant_s",),
-    "acceleration": ("motor_acceleration_rad_s2",),
+    "motor_speed": ("motor_speed_rpm",),
+    "motor_acceleration": ("motor_acceleration_rad_s2",),
 }
 
 
@@ -95,7 +99,7 @@ class PlantParameters:
     check_valve_gain_m3_per_s_pa: float = _assumed(5e-9, "m³/(s Pa)", 1e-10, 1e-6)
     check_valve_crack_pa: float = _assumed(0.2e5, "Pa", 0.0, 5e5)
     relief_valve_gain_m3_per_s_pa: float = _assumed(3.3e-10, "m³/(s Pa)", 1e-11, 1e-6)
-    relief_valve_crack_pa: float = _assumed(160e5, "Pa", 1e5, 1e8)
+    relief_valve_crack_pa: float = _assumed(160e5, "Pa", 0.0, 1e8)
     vapour_pressure_pa: float = _assumed(1e3, "Pa", 0.0, 1e4)
     atmosphere_pa: float = _assumed(101325.0, "Pa", 5e4, 1.2e5)
 
@@ -182,21 +186,41 @@ class PlantParameters:
         ----------
         **factors : float
             Any of ``mass`` (m1, m2, m_load and with them J), ``bulk_modulus``, ``efficiency``, ``leak``,
-            ``motor_time_constant``, ``acceleration``.
+            ``precharge``, ``relief_crack``, ``motor_time_constant``, ``motor_speed``, ``motor_acceleration``.
 
         Examples
         --------
         >>> PlantParameters().scaled(mass=1.5, leak=2.0).load_mass_kg
         60.0
         """
-        changes: dict[str, Any] = {}
+        return replace(self, **self._products(factors))
+
+    def scaled_within_bounds(self, **factors: float) -> "PlantParameters":
+        """Return a copy with groups of parameters multiplied, each parameter clipped to its bounds.
+
+        As for `scaled`, for factors that come from outside: whatever they are, the machine can be computed.
+
+        Examples
+        --------
+        >>> PlantParameters().scaled_within_bounds(efficiency=2.0).volumetric_efficiency
+        1.0
+        """
+        changes = self._products(factors)
+        for item in fields(self):
+            if item.name in changes:
+                low, high = item.metadata["bounds"]
+                changes[item.name] = min(max(changes[item.name], low), high)
+        return replace(self, **changes)
+
+    def _products(self, factors: Mapping[str, float]) -> dict[str, Any]:
+        products: dict[str, Any] = {}
         for group, factor in factors.items():
             if group not in _SCALED_FIELDS:
                 raise ParameterError(f"no scale named {group!r}, must be one of {', '.join(_SCALED_FIELDS)}")
             if isinstance(factor, bool) or not isinstance(factor, Real) or not math.isfinite(factor):
                 raise ParameterError(f"scale {group} is {factor!r}, must be a finite number")
-            changes.update({name: getattr(self, name) * factor for name in _SCALED_FIELDS[group]})
-        return replace(self, **changes)
+            products.update({name: getattr(self, name) * factor for name in _SCALED_FIELDS[group]})
+        return products
 
     def vector(self) -> np.ndarray:
         """Return the flat float64 array that the compiled plant reads, indexed by `plant_sim.layout`."""

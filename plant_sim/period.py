@@ -9,7 +9,7 @@ from plant_sim import layout as at
 from plant_sim.drive import STATE, drive_step
 from plant_sim.hydraulics import accumulator_pressure
 from plant_sim.integrator import advance
-from plant_sim.sensors import quantised_um
+from plant_sim.sensors import IS_SILENT, STATUS, reported_um
 
 SUBSTEPS = 10
 PERIOD_S = PERIOD_NS * 1e-9
@@ -44,12 +44,10 @@ COLUMNS = (
 _CONTROLWORD_START, _TARGET_START = e2e.CONFIGURATION_SIZE, e2e.CONFIGURATION_SIZE + 1
 _SENSOR_STATUS_START, _POSITION_START = e2e.CONFIGURATION_SIZE, e2e.CONFIGURATION_SIZE + 1
 
-_SENSOR_OK = 0
-
 
 @njit(
     "uint64(float64[::1], float64[::1], float64[::1], int64[::1], int64[::1], int64[::1], int64[::1],"
-    " int64[::1], int64, int64, uint64, int64, float64)",
+    " int64[::1], int64[::1], int64, uint64, int64, float64)",
     depends=("dbc.e2e", "plant_sim"),
 )
 def run_period(  # type: ignore[no-untyped-def]
@@ -61,11 +59,11 @@ def run_period(  # type: ignore[no-untyped-def]
     command,
     counter,
     feedback,
-    lsb_um,
+    sensor,
     periods,
     data,
     arrived,
-    noise_m,
+    error_m,
 ):
     """Advance the plant, let the drive take its newest command, and return PositionFeedback's payload.
 
@@ -83,13 +81,13 @@ def run_period(  # type: ignore[no-untyped-def]
         Layouts of DriveCommand and PositionFeedback, from `dbc.codec.MessageCodec.protected_layout`.
     counter : array of int64, shape (1,)
         E2E counter of PositionFeedback.
-    lsb_um : int
-        Resolution of the position sensor.
+    sensor : array of int64
+        See `plant_sim.sensors`. Of a silent sensor there is no payload, and the counter stays.
     periods : int
         Periods to advance with what acted in the last one.
     data, arrived : int
         Payload of the newest DriveCommand; 0 if none arrived since the last call.
-    noise_m : float
+    error_m : float
         Error of the position sensor in this period.
     """
     row[TIME] += periods * PERIOD_NS
@@ -107,7 +105,8 @@ def run_period(  # type: ignore[no-untyped-def]
     target = (((payload >> command[_TARGET_START]) & 0xFFFF) ^ 0x8000) - 0x8000
     row[SPEED_COMMAND] = drive_step(drive, controlword, target, status in e2e.ACCEPTED)
     row[DRIVE_STATE] = drive[STATE]
-    position_um = quantised_um(state[at.POSITION] + noise_m, lsb_um)
-    reading = _SENSOR_OK << feedback[_SENSOR_STATUS_START]
-    reading |= (position_um & 0xFFFF_FFFF) << feedback[_POSITION_START]
+    if sensor[IS_SILENT]:
+        return np.uint64(0)
+    reading = sensor[STATUS] << feedback[_SENSOR_STATUS_START]
+    reading |= (reported_um(sensor, state[at.POSITION] + error_m) & 0xFFFF_FFFF) << feedback[_POSITION_START]
     return e2e.profile2_protect(counter, feedback[: e2e.CONFIGURATION_SIZE], np.uint64(reading))

@@ -15,6 +15,10 @@ from scipy.integrate import solve_ivp
 class Machine:
     efficiency: float = 0.85
     leak: float = 2e-11
+    bulk_modulus: float = 7e8
+    precharge: float = 3.5e5
+    relief_crack: float = 160e5
+    mass: float = 1.0
     constant_pumps: bool = False
 
 
@@ -23,7 +27,7 @@ def derivative(y, command, load_force, machine):
     area_a = pi / 4 * 0.06**2
     area_b = area_a - pi / 4 * 0.03**2
     d_a, d_b = 13.03e-6 / (2 * pi), 9.35e-6 / (2 * pi)
-    p_acc = 3.5e5 * (1.3e-3 / (1.3e-3 - v_oil)) ** 1.3
+    p_acc = machine.precharge * (1.3e-3 / (1.3e-3 - v_oil)) ** 1.3
 
     def leak(p):
         return machine.leak * (p - p_acc)
@@ -32,7 +36,7 @@ def derivative(y, command, load_force, machine):
         return 5e-9 * max(0.0, p_acc - 0.2e5 - p)
 
     def relief(p):
-        return 3.3e-10 * max(0.0, p - p_acc - 160e5)
+        return 3.3e-10 * max(0.0, p - p_acc - machine.relief_crack)
 
     def sat(p):
         return min(1.0, max(-1.0, (p - p_acc) / 1e5))
@@ -44,8 +48,13 @@ def derivative(y, command, load_force, machine):
         q_b = omega * d_b + (1 - machine.efficiency) * abs(omega) * d_b * sat(p_b)
 
     travel = min(max(x, 0.0), 0.4)
-    dp_a = 7e8 / (2e-6 + area_a * travel) * (q_a - leak(p_a) + check(p_a) - relief(p_a) - area_a * v)
-    dp_b = 7e8 / (2e-6 + area_b * (0.4 - travel)) * (-q_b - leak(p_b) + check(p_b) - relief(p_b) + area_b * v)
+    dp_a = (
+        machine.bulk_modulus
+        / (2e-6 + area_a * travel)
+        * (q_a - leak(p_a) + check(p_a) - relief(p_a) - area_a * v)
+    )
+    flow_b = -q_b - leak(p_b) + check(p_b) - relief(p_b)
+    dp_b = machine.bulk_modulus / (2e-6 + area_b * (0.4 - travel)) * (flow_b + area_b * v)
     dv_oil = -q_a + q_b + leak(p_a) + leak(p_b) - check(p_a) - check(p_b) + relief(p_a) + relief(p_b)
 
     d1, d2, x_t = 0.983, 0.4, 0.72 + x
@@ -53,7 +62,7 @@ def derivative(y, command, load_force, machine):
     turned = gamma - acos((d1**2 + d2**2 - 0.72**2) / (2 * d1 * d2))
     h = d1 * d2 * sin(gamma) / x_t
     h_slope = d1 * d2 * cos(gamma) / x_t - h**2 / x_t
-    gravity = 9.81 * (
+    gravity = (machine.mass * 9.81) * (
         25.11 * 0.5 * sin(0.1169 + turned)
         + 21.40 * 0.977 * sin(0.1572 + turned)
         + 40.0 * 1.674 * sin(0.1775 + turned)
@@ -64,7 +73,8 @@ def derivative(y, command, load_force, machine):
     elif x > 0.4:
         stop = -1e8 * (x - 0.4) * max(0.0, 1 + 20 * v)
     force = p_a * area_a - p_b * area_b - 101325.0 * (area_a - area_b) - 500.0 * v - load_force + stop
-    dv = h * (force * h - gravity + 140.9 * h_slope * v**2 / h**3) / (140.9 + 5.0 * h**2)
+    inertia = machine.mass * 140.9
+    dv = h * (force * h - gravity + inertia * h_slope * v**2 / h**3) / (inertia + 5.0 * h**2)
 
     target = min(max(command, -100 * pi), 100 * pi)
     d_omega = min(max((target - omega) / 5e-3, -4000.0), 4000.0)

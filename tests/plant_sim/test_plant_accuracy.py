@@ -81,6 +81,21 @@ def test_constant_efficiency_pumps_follow_the_reference():
     assert position_error_um(0.1, np.full(60, 150.0), 0.0, parameters, machine) < 0.1
 
 
+def test_a_machine_that_changes_under_way_follows_the_reference():
+    """Soft oil, worn pumps, lost gas, relief valves stuck open, a heavier load, from the old state on."""
+    state = initial_state(PlantParameters(), 0.2)
+    parameters = PlantParameters().scaled(
+        bulk_modulus=0.4, efficiency=0.8, leak=3.0, precharge=0.6, relief_crack=0.0, mass=1.4
+    )
+    machine = Machine(
+        bulk_modulus=2.8e8, efficiency=0.68, leak=6e-11, precharge=2.1e5, relief_crack=0.0, mass=1.4
+    )
+    commands, loads = np.r_[np.full(60, 200.0), np.full(60, -100.0)], np.zeros(120)
+    error = np.abs(replay(state, commands, loads, parameters) - integrate(state, commands, loads, machine))
+    assert error[:, at.POSITION].max() * 1e6 < 0.1
+    assert error[:, at.OIL_VOLUME].max() < 1e-9
+
+
 def test_pressures_and_oil_volume_follow_the_reference():
     commands = sine_record(7.0, 60)
     parameters = PlantParameters()

@@ -92,6 +92,27 @@ def test_a_piece_ends_where_a_valve_opens_or_the_loss_is_complete(excess_pa, low
     assert chamber_inflow(LINE_PA + excess_pa, 0.0, 1e-5, LINE_PA, VECTOR)[2:] == (low_pa, high_pa)
 
 
+@given(
+    excess_pa=st.floats(-3e5, 3e5),
+    relief_pa=st.sampled_from([0.0, 0.5e5, 1e5, 2e5]),
+    loss=st.floats(0.0, 1e-4),
+)
+def test_the_pieces_meet_wherever_the_relief_valve_opens(excess_pa, relief_pa, loss):
+    """Also where it opens before the loss is complete: a stuck relief valve."""
+    p = PlantParameters(relief_valve_crack_pa=relief_pa).vector()
+    offset, slope, low, high = chamber_inflow(LINE_PA + excess_pa, 0.0, loss, LINE_PA, p)
+    excess_pa = LINE_PA + excess_pa - LINE_PA
+    assert low <= excess_pa <= high
+    for inside in (max(low, -4e5), min(high, 4e5)):
+        direct = (
+            -P.leak_m3_per_s_pa * inside
+            - loss * min(max(inside / 1e5, -1.0), 1.0)
+            + P.check_valve_gain_m3_per_s_pa * max(0.0, -P.check_valve_crack_pa - inside)
+            - P.relief_valve_gain_m3_per_s_pa * max(0.0, inside - relief_pa)
+        )
+        assert offset + slope * inside == pytest.approx(direct, abs=1e-15)
+
+
 def test_accumulator_holds_its_precharge_and_follows_the_polytrope():
     assert accumulator_pressure(0.0, VECTOR) == pytest.approx(3.5e5)
     assert accumulator_pressure(-1.3e-3, VECTOR) == pytest.approx(3.5e5 / 2**1.3)

@@ -24,7 +24,7 @@ MACHINES = st.builds(Machine, **{item.name: values_of(item) for item in fields(M
 
 def test_the_default_machine_is_the_nominal_one():
     assert Machine().parameters == NOMINAL
-    assert Machine().sensor().lsb_um == 1
+    assert Machine().sensor().read(0.123_456_4) == 123_456
     assert Machine().delay_periods == 1
 
 

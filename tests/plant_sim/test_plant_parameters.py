@@ -4,6 +4,8 @@ from dataclasses import FrozenInstanceError, fields, replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from plant_sim import ParameterError, PlantParameters, PumpModel
 from plant_sim import layout as at
@@ -98,7 +100,10 @@ def test_mass_scale_takes_the_cranes_inertia_along_but_not_the_piston():
         ("efficiency", "volumetric_efficiency"),
         ("leak", "leak_m3_per_s_pa"),
         ("motor_time_constant", "motor_time_constant_s"),
-        ("acceleration", "motor_acceleration_rad_s2"),
+        ("motor_speed", "motor_speed_rpm"),
+        ("motor_acceleration", "motor_acceleration_rad_s2"),
+        ("precharge", "accumulator_precharge_pa"),
+        ("relief_crack", "relief_valve_crack_pa"),
     ],
 )
 def test_a_scale_multiplies_its_field_and_nothing_else(scale, field):
@@ -117,6 +122,23 @@ def test_wrong_scales_are_refused(scales, named):
 def test_scaling_out_of_bounds_names_the_field():
     with pytest.raises(ParameterError, match=r"^volumetric_efficiency is "):
         PlantParameters().scaled(efficiency=1.3)
+
+
+@given(st.dictionaries(st.sampled_from(["mass", "efficiency", "leak", "relief_crack"]), st.floats(-1e4, 1e4)))
+def test_within_bounds_any_factor_is_clipped_to_what_the_parameters_allow(factors):
+    scaled, nominal = PlantParameters().scaled_within_bounds(**factors), PlantParameters()
+    for item in NUMBERS:
+        low, high = item.metadata["bounds"]
+        assert low <= getattr(scaled, item.name) <= high
+    for group, field in (("efficiency", "volumetric_efficiency"), ("leak", "leak_m3_per_s_pa")):
+        low, high = next(item.metadata["bounds"] for item in NUMBERS if item.name == field)
+        asked = getattr(nominal, field) * factors.get(group, 1.0)
+        assert getattr(scaled, field) == (asked if low <= asked <= high else low if asked < low else high)
+
+
+def test_within_bounds_nonsense_is_still_refused():
+    with pytest.raises(ParameterError, match="leak"):
+        PlantParameters().scaled_within_bounds(leak=float("nan"))
 
 
 def test_vector_is_complete_and_finite():

@@ -16,7 +16,7 @@ SCALES = st.fixed_dictionaries(
         "efficiency": st.floats(0.8, 1.1),
         "leak": st.floats(0.0, 2.5),
         "motor_time_constant": st.floats(0.4, 4.0),
-        "acceleration": st.floats(0.5, 1.0),
+        "motor_acceleration": st.floats(0.5, 1.0),
     }
 )
 
