@@ -1,5 +1,6 @@
 """What a test holds in its hand: command, run, assert in units."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,14 +8,18 @@ import numpy as np
 
 from dbc.codec import signal_name
 from dbc.contract import Contract
+from dbc.node import PERIOD_NS
 from firmware_py.state_machine import State as ControllerState
 from firmware_py.task import Fault
-from hil.bus.wire import ErrorState, FrameFault, Port, Wire
+from hil.bus.wire import ErrorState
+from hil.faults.catalogue import fault_of
+from hil.faults.fault import Fault as InjectedFault
+from hil.faults.machine import MAX_LOAD_N
 from hil.measure import M_TO_MM, Trace, bus_load_of_windows, figures_of, setting_of, timing_in, trace_of
 from hil.report import OutputDirectory
-from hil.run.options import SIDES, BenchError, Recording
+from hil.run.options import BenchError, Recording
 from hil.run.rig import Rig
-from hil.scenario import MAX_LOAD_N, PERIOD_S, TimingLimits, controller_of
+from hil.scenario import PERIOD_S, TimingLimits, controller_of
 from hil.signals import Series, signal_of
 from hil.supervisor import BRING_UP_PERIODS, Reference
 from hil.timing import Figure, Timing
@@ -63,6 +68,7 @@ class Bench:
         self._session = rig.begin(self.controller, position_m, bit_rate)
         self._supervisor = self._session.supervisor
         self._period = BRING_UP_PERIODS
+        self._faults: list[InjectedFault] = []
         self._recording: Recording | None = None
         self._trace: Trace | None = None
         self._timing: Timing | None = None
@@ -127,54 +133,68 @@ class Bench:
         self._period += periods
         self._go_on()
 
-    # what can go wrong, in virtual time
+    # what can go wrong
+
+    def inject(self, fault: str | InjectedFault, **parameters: Any) -> None:
+        """Let something go wrong, now or `at_s` seconds from now.
+
+        Parameters
+        ----------
+        fault : str or hil.faults.fault.Fault
+            A kind of `hil.faults.catalogue`, with its parameters, or a fault.
+
+        Raises
+        ------
+        FaultError
+            If there is no such fault, or it cannot be had in this mode.
+        """
+        if isinstance(fault, str):
+            fault = fault_of(fault, parameters)
+        begin = max(self._period, self._supervisor.next_period)
+        self._session.inject(fault, begin * PERIOD_NS)
+        self._faults.append(replace(fault, at_s=(begin - BRING_UP_PERIODS) * PERIOD_S + fault.at_s))
 
     def drop(self, message: str, count: int = 1) -> None:
-        """Lose the next frames of a message."""
-        self._spoil(message, FrameFault.DROP, 0, count)
+        """Inject a `drop`."""
+        self.inject("drop", message=message, count=count)
 
     def corrupt(self, message: str, bit: int, count: int = 1) -> None:
-        """Flip a payload bit of the next frames of a message, behind CAN's own CRC."""
-        bits = 8 * self._contract.message(message).dlc
-        if not 0 <= bit < bits:
-            raise ValueError(f"{message} has bits 0 to {bits - 1}, not {bit}")
-        self._spoil(message, FrameFault.CORRUPT, 1 << bit, count)
+        """Inject a `corrupt`."""
+        self.inject("corrupt", message=message, bit=bit, count=count)
 
     def delay(self, message: str, delay_s: float, count: int = 1) -> None:
-        """Hand the next frames of a message over later; what follows may overtake them."""
-        if delay_s < 0:
-            raise ValueError(f"a frame cannot be early: delay_s is {delay_s}")
-        self._spoil(message, FrameFault.DELAY, round(delay_s * 1e9), count)
+        """Inject a `delay`."""
+        self.inject("delay", message=message, delay_s=delay_s, count=count)
 
     def repeat(self, message: str, count: int = 1) -> None:
-        """Let the next frames of a message carry the payload of the last one, counter and CRC included."""
-        self._spoil(message, FrameFault.REPEAT, 0, count)
+        """Inject a `repeat`."""
+        self.inject("repeat", message=message, count=count)
 
     def destroy(self, message: str, bit: int = 20, count: int = 1) -> None:
-        """Hit the next attempts to send a message with a bad bit: error frames end them, others follow."""
-        if not 0 <= bit < 130:
-            raise ValueError(f"a frame has bits 0 to 129, not {bit}")
-        self._spoil(message, FrameFault.DESTROY, bit, count)
+        """Inject a `destroy`."""
+        self.inject("destroy", message=message, bit=bit, count=count)
 
     def disturb(self, bit_error_rate: float, duration_s: float, seed: int = 0) -> None:
-        """Let every bit be bad with a probability, for some time; see `hil.bus.wire.Wire.disturb`."""
-        if not 0.0 < duration_s < np.inf:
-            raise ValueError(f"noise takes time, not {duration_s} s")
-        self._wire("disturb").disturb(bit_error_rate, round(duration_s * 1e9), seed)
-
-    def error_state(self, node: str) -> ErrorState:
-        """Return error counters and state of the CAN controller of "plant" or "controller"."""
-        return self._wire("error_state").error_state(self._port(node))
+        """Inject `bit_errors`."""
+        self.inject("bit_errors", rate=bit_error_rate, duration_s=duration_s, seed=seed)
 
     def power_off(self, node: str) -> None:
-        """Cut "plant" or "controller" off."""
-        self._wire("power_off").detach(self._port(node))
+        """Inject a `power_off`."""
+        self.inject("power_off", node=node)
 
     def power_on(self, node: str) -> None:
-        """Start a node anew that was cut off, or reset one that was not."""
-        wire, port = self._wire("power_on"), self._port(node)
-        wire.reconnect(port)
-        wire.start(port)
+        """Inject a `reset`: start a node anew that was cut off, or reset one that was not."""
+        self.inject("reset", node=node)
+
+    def error_state(self, node: str) -> ErrorState:
+        """Return error counters and state of a node's CAN controller, in virtual time."""
+        wire = self._session.wire
+        if wire is None:
+            raise BenchError("error_state needs virtual time: use --hil-mode inprocess or lockstep")
+        if node not in self._session.ports:
+            known = ", ".join(sorted(self._session.ports))
+            raise ValueError(f"there is no node {node!r}: choose one of {known}")
+        return wire.error_state(self._session.ports[node])
 
     # what came of it
 
@@ -285,7 +305,14 @@ class Bench:
         figures = figures_of(
             self.recording, self.trace, self.timing, self._contract, self.bit_rate, self.mode
         )
-        return {"scenario": name, "controller": self.controller, **self._setting, **figures, "paper": None}
+        return {
+            "scenario": name,
+            "controller": self.controller,
+            **self._setting,
+            **figures,
+            "faults": [fault.table for fault in self._faults],
+            "paper": None,
+        }
 
     def write(self, folder: Path, name: str) -> list[Path]:
         """Leave figures, trace, bus log and picture in a folder; return the files."""
@@ -311,20 +338,3 @@ class Bench:
         """Return the newest known value of a trace column, or where there is none of a signal."""
         series = self._column(column, 1.0) if column in self.trace else self.signal(signal)
         return int(series.last) if series.known.size else None
-
-    def _spoil(self, message: str, fault: FrameFault, argument: int, count: int) -> None:
-        if count < 1:
-            raise ValueError(f"count is {count}, must be 1 or more")
-        can_id = self._contract.message(message).can_id
-        self._wire(fault.name.lower()).spoil(can_id, fault, argument, count)
-
-    def _port(self, node: str) -> Port:
-        if node not in SIDES:
-            raise ValueError(f"there is no node {node!r}: choose one of {', '.join(sorted(SIDES))}")
-        return self._session.ports[node]
-
-    def _wire(self, what: str) -> Wire:
-        wire = self._session.wire
-        if wire is None:
-            raise BenchError(f"{what} needs virtual time: use --hil-mode inprocess or lockstep")
-        return wire

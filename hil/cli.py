@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
 from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import Wire
+from hil.faults.catalogue import fault_of_text
+from hil.faults.fault import FaultError
 from hil.measure import result_of, trace_of
 from hil.report import OutputDirectory
 from hil.run.arguments import ratio
@@ -57,6 +60,7 @@ REFUSALS = (
     CalibrationError,
     can.CanInitializationError,
     ContractError,
+    FaultError,
     LinkError,
     ParameterError,
     ScenarioError,
@@ -100,10 +104,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
     run.add_argument("scenario", help=argparse.SUPPRESS)
-    laws = ", ".join(CONTROLLERS)
-    run.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (default: tuning's)")
+    laws = " ".join(CONTROLLERS)
+    run.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (tuning's)")
     add_tuning_arguments(run)
     run.add_argument("--machine", metavar="K=V,...", help="differing machine: mass=1.5,leak=2 ...")
+    run.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="KIND,K=V,...",
+        help="what goes wrong; may be repeated",
+    )
     run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
@@ -165,6 +176,10 @@ def _run(arguments: argparse.Namespace) -> int:
     scenario = load_scenario(arguments.scenario, arguments.duration)
     if arguments.machine is not None:
         scenario = replace(scenario, machine=scenario.machine.with_text(arguments.machine))
+    faults = *scenario.faults, *map(fault_of_text, arguments.fault)
+    scenario = replace(scenario, faults=tuple(sorted(faults, key=attrgetter("at_s"))))
+    if arguments.mode == "realtime" and (virtual := [f for f in scenario.faults if f.needs_virtual_time]):
+        raise BenchError(f"the fault {virtual[0].text} needs virtual time: use --mode inprocess or lockstep")
     if arguments.bitrate is not None:
         check_bit_rate(arguments.bitrate)
     bus = arguments.interface, arguments.channel, arguments.bitrate
@@ -259,6 +274,7 @@ def _table(result: dict[str, Any]) -> Table:
         ("feedback to command, maximum / µs", _number(latency["max"], ".0f")),
         ("missed periods", str(result["timing"]["missed_periods"])),
         ("late periods", str(result["timing"]["late_periods"])),
+        ("faults", str(len(result["faults"]))),
         ("start-up / s", _number(result["startup_s"], ".1f")),
         ("times real time", _number(result["realtime_factor"], ".1f")),
     )

@@ -19,7 +19,7 @@ from firmware_py.kernel.layout import (
     ST_SIZE,
 )
 from hil.references import SETPOINT_LSB_M, setpoint_counts
-from hil.scenario import Scenario
+from hil.scenario import Scenario, ScenarioError
 from hil.supervisor import BRING_UP_PERIODS
 from plant_sim.drive import COUNTS_PER_RPM, RAD_S_PER_COUNT
 from plant_sim.equilibrium import initial_state
@@ -224,6 +224,8 @@ def play_closed_loop(
     run : ClosedLoopRun
         Its `reference_m` is the scenario's, not rounded.
     """
+    if scenario.faults:
+        raise ScenarioError(f"{scenario.name} has faults: they need the bus")
     machine = machine or scenario.machine
     parameters, reference_m = machine.parameters, scenario.reference_m()
     setpoint = setpoint_counts(reference_m)

@@ -160,6 +160,7 @@ def result_of(
         "controller": options.controller,
         **setting_of(options),
         **figures,
+        "faults": [fault.table for fault in scenario.faults],
         "limits": limits,
         "timing_limits": scenario.timing.given() or None,
         "within_limits": within,

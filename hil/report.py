@@ -126,6 +126,25 @@ def write_bus_log(path: Path, traffic: np.ndarray) -> None:
             writer.on_message_received(to_message(time_ns, Frame(can_id, dlc, data), channel="can0"))
 
 
+def _mark_faults(axes: Any, faults: list[dict[str, Any]]) -> None:
+    """Draw a line where a fault begins, with its kind at the top."""
+    for fault in faults:
+        for axis in axes:
+            axis.axvline(fault["at_s"], color=RED, lw=0.8, ls=":")
+        axes[0].annotate(
+            fault["kind"],
+            (fault["at_s"], 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(-2, -2),
+            textcoords="offset points",
+            rotation="vertical",
+            ha="right",
+            va="top",
+            fontsize="x-small",
+            color=RED,
+        )
+
+
 def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
     """Draw position, tracking error and observed disturbance over time (the paper's Figure 5)."""
     import matplotlib  # 0.3 s, which only drawing should cost
@@ -165,5 +184,6 @@ def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
         if axis.lines:
             axis.legend(loc="best", fontsize="small")
         axis.margins(x=0.01)
+    _mark_faults(axes, result["faults"])
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

@@ -2,21 +2,28 @@
 
 import math
 import tomllib
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import resources
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
 from dbc.node import PERIOD_NS
+from hil.faults.catalogue import KINDS, fault_of
+from hil.faults.fault import LONGEST_S, Fault, FaultError
+from hil.faults.machine import MAX_LOAD_N
 from hil.references import REFERENCES
+from hil.toml_lines import Path, line_of
 from plant_sim.machine import Machine
 from plant_sim.parameters import ParameterError
 
 CONTROLLERS = ("p", "pi", "adrc", "pi_ff", "scheduled")
 PERIOD_S = PERIOD_NS * 1e-9
-MAX_LOAD_N = 1e6
+REQUIRED = ("title", "reference", "duration_s")
+OPTIONAL = ("load", "limits", "paper", "timing", "machine", "fault")
+FIGURES = ("rms_mm", "max_mm")
 
 
 def controller_of(law: int) -> str:
@@ -77,6 +84,8 @@ class Scenario:
         Limits on the timing, whichever controller is played.
     machine : Machine
         What it is played on.
+    faults : tuple of Fault
+        What goes wrong, at times from the start of the reference.
     """
 
     name: str
@@ -88,6 +97,7 @@ class Scenario:
     paper: dict[str, dict[str, float]]
     timing: TimingLimits = field(default_factory=TimingLimits)
     machine: Machine = field(default_factory=Machine)
+    faults: tuple[Fault, ...] = ()
 
     @property
     def periods(self) -> int:
@@ -123,7 +133,7 @@ class Scenario:
 def builtin_names() -> list[str]:
     """Return the names of the scenarios in the package."""
     files = resources.files("hil.scenarios").iterdir()
-    return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
+    return sorted(FilePath(file.name).stem for file in files if file.name.endswith(".toml"))
 
 
 def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
@@ -142,12 +152,12 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
         If there is none of that name, or a key is missing, unknown or has a wrong value.
     """
     if name.endswith(".toml"):
-        path = Path(name)
+        path = FilePath(name)
         if not path.is_file():
             raise ScenarioError(f"there is no scenario file {name}")
         text = path.read_text(encoding="utf-8", errors="replace")
     elif name in builtin_names():
-        path = Path(name)
+        path = FilePath(name)
         text = resources.files("hil.scenarios").joinpath(f"{name}.toml").read_text(encoding="utf-8")
     else:
         known = ", ".join(builtin_names())
@@ -156,77 +166,139 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{name}: {error}") from error
+    changes: dict[str, Any] = {}
     if duration_s is not None:
-        content |= {"duration_s": duration_s, "limits": {}, "paper": {}, "timing": {}}
-    return _checked(path.stem, content)
+        changes = {"limits": {}, "paper": {}, "timing": TimingLimits(), "duration_s": _duration_s(duration_s)}
+    try:
+        return replace(_checked(path.stem, content), **changes)
+    except _WrongKeyError as error:
+        line = line_of(text, error.path)
+        where = name if line is None else f"{name}: line {line}"
+        raise ScenarioError(f"{where}: {error}") from error
+
+
+class _WrongKeyError(ScenarioError):
+    """What is wrong, and where in the file; a key that is missing is looked for in its table."""
+
+    def __init__(self, path: Path, message: str) -> None:
+        super().__init__(message)
+        self.path = path
 
 
 def _checked(name: str, content: dict[str, Any]) -> Scenario:
-    required = {"title", "reference", "duration_s"}
-    optional = {"load", "limits", "paper", "timing", "machine"}
-    if missing := sorted(required - set(content)):
-        raise ScenarioError(f"{name}: missing key {missing[0]!r}")
-    if unknown := sorted(set(content) - required - optional):
-        allowed = ", ".join(sorted(required | optional))
-        raise ScenarioError(f"{name}: unknown key {unknown[0]!r}; allowed are {allowed}")
+    _known(content, (), REQUIRED, OPTIONAL)
     if not isinstance(content["title"], str):
-        raise ScenarioError(f"{name}: title is {content['title']!r}, must be a text")
+        raise _WrongKeyError(("title",), f"title is {content['title']!r}, must be a text")
     if content["reference"] not in list(REFERENCES):
-        raise ScenarioError(
-            f"{name}: reference {content['reference']!r} is not one of {', '.join(REFERENCES)}"
+        raise _WrongKeyError(
+            ("reference",), f"reference {content['reference']!r} is not one of {', '.join(REFERENCES)}"
         )
-    duration_s = content["duration_s"]
-    if not _is_number(duration_s) or not PERIOD_S <= duration_s <= 3600:
-        raise ScenarioError(f"{name}: duration_s is {duration_s!r}, must be from {PERIOD_S} to 3600 s")
-    load = content.get("load", [])
-    if not isinstance(load, list) or not all(_is_load_step(step) for step in load):
-        raise ScenarioError(
-            f"{name}: load must be a list of [time_s, force_n], from 0 s on and within {MAX_LOAD_N:g} N"
-        )
-    for key in ("limits", "paper"):
-        if not isinstance(content.get(key, {}), dict):
-            raise ScenarioError(f"{name}: {key} must be a table by controller")
-        for controller, figures in content.get(key, {}).items():
-            if controller not in CONTROLLERS or not _are_figures(figures):
-                raise ScenarioError(
-                    f"{name}: {key}.{controller} must be one of {', '.join(CONTROLLERS)} "
-                    "with rms_mm and max_mm"
-                )
     return Scenario(
         name=name,
         title=content["title"],
         reference=content["reference"],
-        duration_s=float(duration_s),
-        load=tuple((float(time_s), float(force_n)) for time_s, force_n in load),
-        limits=content.get("limits", {}),
-        paper=content.get("paper", {}),
-        timing=_timing_limits(name, content.get("timing", {})),
-        machine=_machine(name, content.get("machine", {})),
+        duration_s=_duration_s(content["duration_s"]),
+        load=_load(content.get("load", [])),
+        limits=_figures(content, "limits"),
+        paper=_figures(content, "paper"),
+        timing=_timing_limits(content.get("timing", {})),
+        machine=_machine(content.get("machine", {})),
+        faults=_faults(content.get("fault", [])),
     )
 
 
-def _timing_limits(name: str, table: Any) -> TimingLimits:
-    allowed = {limit.name for limit in fields(TimingLimits)}
-    hint = f"allowed are {', '.join(sorted(allowed))}"
-    if not isinstance(table, dict):
-        raise ScenarioError(f"{name}: timing must be a table of limits; {hint}")
-    if unknown := sorted(set(table) - allowed):
-        raise ScenarioError(f"{name}: unknown key {unknown[0]!r} in timing; {hint}")
+def _known(table: dict[str, Any], path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+    """Make sure that a table has the keys it needs, and no others."""
+    within = f" in {_dotted(path)}" if path else ""
+    allowed = ", ".join([*required, *optional])
+    for key in table:
+        if key not in (*required, *optional):
+            raise _WrongKeyError((*path, key), f"unknown key {key!r}{within}; allowed are {allowed}")
+    for key in required:
+        if key not in table:
+            raise _WrongKeyError(path, f"missing key {key!r}{within}; needed are {', '.join(required)}")
+
+
+def _dotted(path: Path) -> str:
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).lstrip(".")
+
+
+def _table(value: Any, path: Path, of_what: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise _WrongKeyError(path, f"{_dotted(path)} is {value!r}, must be a table {of_what}")
+    return value
+
+
+def _duration_s(value: Any) -> float:
+    if not _is_number(value) or not PERIOD_S <= value <= LONGEST_S:
+        raise _WrongKeyError(
+            ("duration_s",), f"duration_s is {value!r}, must be from {PERIOD_S} to {LONGEST_S:g} s"
+        )
+    return float(value)
+
+
+def _load(steps: Any) -> tuple[tuple[float, float], ...]:
+    if not isinstance(steps, list) or not all(_is_load_step(step) for step in steps):
+        raise _WrongKeyError(
+            ("load",), f"load must be a list of [time_s, force_n], from 0 s on and within {MAX_LOAD_N:g} N"
+        )
+    return tuple((float(time_s), float(force_n)) for time_s, force_n in steps)
+
+
+def _figures(content: dict[str, Any], key: str) -> dict[str, dict[str, float]]:
+    """Return `limits` or `paper`: figures by controller."""
+    by_controller = _table(content.get(key, {}), (key,), f"by controller: {', '.join(CONTROLLERS)}")
+    for controller, figures in by_controller.items():
+        path = key, controller
+        if controller not in CONTROLLERS:
+            raise _WrongKeyError(path, f"{_dotted(path)} must be one of {', '.join(CONTROLLERS)}")
+        _known(_table(figures, path, "with rms_mm and max_mm"), path, FIGURES)
+        for figure, value in figures.items():
+            if not _is_number(value):
+                raise _WrongKeyError(
+                    (*path, figure), f"{_dotted((*path, figure))} is {value!r}, must be a number"
+                )
+    return by_controller
+
+
+def _timing_limits(value: Any) -> TimingLimits:
+    names = [limit.name for limit in fields(TimingLimits)]
+    table = _table(value, ("timing",), f"of limits: {', '.join(names)}")
+    _known(table, ("timing",), (), names)
     for key, limit in table.items():
         counted = not key.endswith("_us")
         if not _is_number(limit) or limit < 0 or (counted and not isinstance(limit, int)):
             kind = "whole number" if counted else "number of µs"
-            raise ScenarioError(f"{name}: timing.{key} is {limit!r}, must be a {kind} from 0 on; {hint}")
+            raise _WrongKeyError(("timing", key), f"timing.{key} is {limit!r}, must be a {kind} from 0 on")
     return TimingLimits(**table)
 
 
-def _machine(name: str, table: Any) -> Machine:
-    if not isinstance(table, dict):
-        raise ScenarioError(f"{name}: machine must be a table")
+def _machine(value: Any) -> Machine:
+    table = _table(value, ("machine",), "of what differs from the nominal one")
+    machine = Machine()
+    for key, of_key in table.items():
+        try:
+            machine = machine.with_changes({key: of_key})
+        except ParameterError as error:
+            raise _WrongKeyError(("machine", key), str(error)) from error
+    return machine
+
+
+def _faults(value: Any) -> tuple[Fault, ...]:
+    if not isinstance(value, list):
+        raise _WrongKeyError(("fault",), "fault is no list: write each as a table [[fault]]")
+    return tuple(
+        _fault(_table(table, ("fault", i), "[[fault]]"), ("fault", i)) for i, table in enumerate(value)
+    )
+
+
+def _fault(table: dict[str, Any], path: Path) -> Fault:
+    if "kind" not in table:
+        raise _WrongKeyError(path, f"missing key 'kind' in {_dotted(path)}; it is one of {', '.join(KINDS)}")
     try:
-        return Machine.from_table(table)
-    except ParameterError as error:
-        raise ScenarioError(f"{name}: {error}") from error
+        return fault_of(table["kind"], {key: value for key, value in table.items() if key != "kind"})
+    except FaultError as error:
+        raise _WrongKeyError((*path, error.key) if error.key in table else path, str(error)) from error
 
 
 def _is_number(value: Any) -> bool:
@@ -240,12 +312,4 @@ def _is_load_step(step: Any) -> bool:
         and all(_is_number(value) for value in step)
         and step[0] >= 0
         and abs(step[1]) <= MAX_LOAD_N
-    )
-
-
-def _are_figures(figures: Any) -> bool:
-    return (
-        isinstance(figures, dict)
-        and set(figures) == {"rms_mm", "max_mm"}
-        and all(_is_number(value) for value in figures.values())
     )

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from heapq import heappop, heappush
 from itertools import count
+from typing import Any
 
 import numpy as np
 
@@ -86,13 +87,14 @@ class Supervisor:
         self._chunk: tuple[list[float], list[int]] = ([], [])
         self._chunk_begin = 0
         self._words = {"enable": 0, "law": law_of(controller), "fault_reset": 0, "load_n": 0}
-        self._plan: list[tuple[int, int, dict[str, int | Reference]]] = []
+        self._added_load_n = 0
+        self._plan: list[tuple[int, int, dict[str, Any]]] = []
         self._planned = count()
         for enable, periods in ((0, _ARMING_PERIODS), (1, _ENABLE_PERIODS)):
             for period in periods:
                 self.plan(period, enable=enable)
 
-    def plan(self, period: int, **words: int | Reference) -> None:
+    def plan(self, period: int, **words: Any) -> None:
         """Change something in a period that is to come.
 
         Parameters
@@ -100,7 +102,8 @@ class Supervisor:
         period : int
             Since power-on; one that is over means the next.
         **words
-            `enable`, `fault_reset`, `load_n` (int) or `reference` (`Reference`).
+            `enable`, `fault_reset`, `load_n` and `add_load_n` (int; forces on top of `load_n` add up),
+            `reference` (`Reference`), or `control` (command, identifier and value of a BenchControl).
         """
         heappush(self._plan, (period, next(self._planned), words))
 
@@ -110,7 +113,7 @@ class Supervisor:
         for period, force_n in scenario.load_changes:
             self.plan(BRING_UP_PERIODS + period, load_n=force_n)
 
-    def steer(self, **words: int | Reference) -> None:
+    def steer(self, **words: Any) -> None:
         """Change something with the next period; see `plan`."""
         self.plan(self.next_period, **words)
 
@@ -132,7 +135,7 @@ class Supervisor:
             sends = ((now_ns, self._setpoint.frame(payload)),)
         if frames:
             sends += tuple((now_ns, frame) for frame in frames)
-        self.record.append((now_ns, reference_m, raw, self._words["load_n"]))
+        self.record.append((now_ns, reference_m, raw, self._load_n))
         self.next_period = period + 1
         return Actions(self._origin_ns + (period + 1) * PERIOD_NS, sends)
 
@@ -146,23 +149,23 @@ class Supervisor:
         commanded = not is_first and period // _COMMAND_PERIODS > (self.next_period - 1) // _COMMAND_PERIODS
         if not (is_first or commanded or (self._plan and self._plan[0][0] <= period)):
             return []
-        frames = []
+        frames = [self._control_frame(BenchCommand.RESET, 0, self._initial[1])] if is_first else []
         loaded = is_first
         while self._plan and self._plan[0][0] <= period:
             _, _, words = heappop(self._plan)
+            if control := words.pop("control", None):
+                frames.append(self._control_frame(*control))
             if reference := words.pop("reference", None):
-                assert callable(reference)
                 self._reference, self._reference_begin = reference, period
                 self._chunk, self._chunk_begin = ([], []), period
-            loaded |= "load_n" in words
+            loaded |= bool(words.keys() & {"load_n", "add_load_n"})
+            self._added_load_n += words.pop("add_load_n", 0)
             commanded |= bool(words.keys() & {"enable", "fault_reset"})
-            self._words |= words  # type: ignore[arg-type]
-        if is_first:
-            frames.append(self._reset_frame())
+            self._words |= words
         if commanded and self._command.can_id not in self.silent:
             frames.append(self._command_frame())
         if loaded:
-            frames.append(self._bench_load.frame(self._bench_load.pack(self._words["load_n"])))
+            frames.append(self._bench_load.frame(self._bench_load.pack(self._load_n)))
         return frames
 
     def _position_in(self, period: int) -> tuple[float, int]:
@@ -178,11 +181,15 @@ class Supervisor:
             self._chunk = reference_m.tolist(), setpoint_counts(reference_m).tolist()
         return self._chunk[0][index], self._chunk[1][index]
 
+    @property
+    def _load_n(self) -> int:
+        return self._words["load_n"] + self._added_load_n
+
     def _command_frame(self) -> Frame:
         message, words = self._command, self._words
         payload = message.pack(words["enable"], words["law"], words["fault_reset"])
         return message.frame(self._protect_command(payload))
 
-    def _reset_frame(self) -> Frame:
+    def _control_frame(self, command: int, identifier: int, value: int) -> Frame:
         message = self._bench_control
-        return message.frame(message.pack(BenchCommand.RESET, 0, self._initial[1]))
+        return message.frame(message.pack(command, identifier, value))

@@ -133,6 +133,16 @@ def pack_actions_into(answer: bytearray, actions: Actions) -> int:
     return at
 
 
+def unpack_actions(answer: bytearray, length: int) -> Actions:
+    """Return the actions that `pack_actions_into` has put into the first bytes of `answer`."""
+    if not length:
+        return NOTHING
+    (wake_ns,) = _WAKE.unpack_from(answer)
+    frames = _TIMED_FRAME.iter_unpack(memoryview(answer)[_WAKE.size : length])
+    sends = tuple((send_ns, Frame(*frame)) for send_ns, *frame in frames)
+    return Actions(None if wake_ns == NO_WAKE else wake_ns, sends)
+
+
 def socket_directory() -> Path:
     """Return the directory of this user's hub sockets, made with mode 0700.
 

@@ -6,7 +6,7 @@ nodes were attached. `hil.bus.wire_core` processes the events; here nodes come, 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from dbc.frame import Frame
 from dbc.jit import entry_point
-from dbc.node import NOTHING, Node
+from dbc.node import NOTHING, Actions, Node
 from hil.bus import confinement, link
 from hil.bus import wire_core as at
 from hil.bus.wire_core import NEVER, arbitration_key
@@ -25,6 +25,9 @@ _advance, _hand_over = entry_point(at.advance), entry_point(at.hand_over)
 _local_ns, _bus_ns = entry_point(at.local_ns), entry_point(at.bus_ns)
 _QUEUE_ROWS = 4096
 _LOG_ROWS = 1 << 14
+
+Edit = Callable[[Actions], Actions]
+"""Changes what a node wants before the wire hears of it; times are those of the node's own clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +115,8 @@ class Port:
     packet: memoryview
     ask: Callable[[memoryview, bytearray], int]
     connected: bool = True
+    plugged_in: bool = True
+    edits: list[Edit] = field(default_factory=list)
 
 
 class Wire:
@@ -201,6 +206,48 @@ class Wire:
         """Put a node that was cut off back to its place; `start` powers it on."""
         port.connected = True
         self._set_filters()
+
+    def unplug(self, port: Port) -> None:
+        """Let a node go on without the bus: what it had queued is gone; the bench channel is left to it."""
+        if port.plugged_in:
+            port.plugged_in = False
+            self.withdraw(port.order)
+            self._set_filters()
+            self.edit(port, self._unheard)
+
+    def plug_in(self, port: Port) -> None:
+        """Put a node that was unplugged back on the bus."""
+        if not port.plugged_in:
+            port.plugged_in = True
+            self._set_filters()
+            self.stop_editing(port, self._unheard)
+
+    def edit(self, port: Port, edit: Edit) -> None:
+        """Change from now on what a node answers, after what others have changed before."""
+        port.edits.append(edit)
+        self._set_way(port)
+
+    def stop_editing(self, port: Port, edit: Edit) -> None:
+        """Change it no more; may be asked for by the edit itself."""
+        port.edits.remove(edit)
+        self._set_way(port)
+
+    def put_off(self, port: Port, late_ns: int) -> None:
+        """Let the wake-up that a node waits for be late."""
+        words = self._port_words[port.order]
+        if words[at.WAKE] != NEVER:
+            words[at.WAKE] += late_ns
+
+    def set_drift(self, port: Port, drift_ppb: int) -> None:
+        """Let a node's clock run fast from now on, by so many ns each s; it does not jump."""
+        words, old = self._port_words[port.order], port.clock
+        now_ns = old.local(self.now_ns)
+        wake_ns = old.local(int(words[at.WAKE])) if words[at.WAKE] != NEVER else None
+        drifting = Clock(0, drift_ppb)
+        port.clock = new = replace(drifting, phase_ns=self.now_ns - drifting.bus(now_ns))
+        words[[at.PHASE, at.DRIFT_PPB]] = new.phase_ns, new.drift_ppb
+        if wake_ns is not None:
+            words[at.WAKE] = max(new.bus(wake_ns), self.now_ns)
 
     def start(self, port: Port) -> None:
         """Power a node on now; it has seen no error."""
@@ -393,10 +440,29 @@ class Wire:
             node = port.node
             if port.connected:
                 known = node.latched if node.accepts is None else node.accepts
-                rows += [(can_id, port.order, can_id in node.latched) for can_id in sorted(known)]
-                rows += [(at.EVERY_ID, port.order, False)] if node.accepts is None else []
+                ids = [can_id for can_id in sorted(known) if port.plugged_in or can_id in self._out_of_band]
+                rows += [(can_id, port.order, can_id in node.latched) for can_id in ids]
+                rows += [(at.EVERY_ID, port.order, False)] if node.accepts is None and port.plugged_in else []
         self._filters = np.array(rows, np.int64).reshape(-1, at.FILTER_SIZE)
         self._core[at.FILTERS] = len(rows)
+
+    def _set_way(self, port: Port) -> None:
+        """Ask a node by way of its edits, if there are any."""
+        linked = not port.edits and port.node.link != at.NO_LINK
+        self._port_words[port.order, at.LINK] = port.node.link if linked else at.NO_LINK
+        port.ask = partial(self._ask_and_edit, port) if port.edits else port.node.ask
+
+    def _ask_and_edit(self, port: Port, packet: memoryview, answer: bytearray) -> int:
+        self._port_words[port.order, at.EXCHANGES] += port.node.link != at.NO_LINK
+        actions = link.unpack_actions(answer, port.node.ask(packet, answer))
+        for edit in (*port.edits,):
+            actions = edit(actions)
+        return link.pack_actions_into(answer, actions)
+
+    def _unheard(self, actions: Actions) -> Actions:
+        """Take away what a node sends over the bus; the bench channel is none."""
+        heard = tuple(send for send in actions.sends if send[1].can_id in self._out_of_band)
+        return actions._replace(sends=heard)
 
 
 def _signed(word: int) -> int:

@@ -3,6 +3,8 @@
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from heapq import heappop, heappush
+from itertools import count
 
 import numpy as np
 
@@ -11,7 +13,8 @@ from dbc.node import PERIOD_NS, Node
 from firmware_py.node import PHASE_NS, Controller
 from hil.bus import link
 from hil.bus.wire import Clock, Port, Wire
-from hil.run.options import INTERRUPTED, Recording, RigOptions, RunOptions, check_bit_rate
+from hil.faults.fault import Fault, Stage
+from hil.run.options import INTERRUPTED, BenchError, Recording, RigOptions, RunOptions, check_bit_rate
 from hil.run.rig import Rig, play
 from hil.supervisor import Supervisor
 from plant_sim.node import Plant
@@ -53,6 +56,7 @@ class InprocessRig(Rig):
 
         return VirtualSession(
             self.options,
+            self.contract,
             make_wire(self.contract, bit_rate),
             supervisor,
             [plant, firmware],
@@ -68,6 +72,8 @@ class VirtualSession:
     ----------
     options : RigOptions
         What the rig was asked for.
+    contract : Contract
+        The DBC.
     wire : Wire
         A new one.
     supervisor : Supervisor
@@ -85,6 +91,7 @@ class VirtualSession:
     def __init__(
         self,
         options: RigOptions,
+        contract: Contract,
         wire: Wire,
         supervisor: Supervisor,
         nodes: Sequence[Node | link.Askable],
@@ -102,9 +109,23 @@ class VirtualSession:
         self.ports: dict[str, Port] = {}
         for node in (supervisor, *nodes):
             self.ports[node.name] = wire.attach(node, CLOCKS[node.name])
+        self.stage = Stage(contract, supervisor, wire, self.ports, self.at)
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._entries = count()
         self._startup_s = time.perf_counter() - begin_s
         self._wall_s = 0.0
         self._advance(self._power_on)
+
+    def inject(self, fault: Fault, origin_ns: int) -> None:
+        """Have something go wrong; see `hil.run.rig.Session`."""
+        fault.inject(self.stage, origin_ns)
+
+    def at(self, bus_ns: int, action: Callable[[], None]) -> None:
+        """Have something done at a bus time, before the wire's events at that time; at once if it is over."""
+        if bus_ns <= self.wire.now_ns:
+            action()
+        else:
+            heappush(self._agenda, (bus_ns, next(self._entries), action))
 
     def run_to(self, period: int) -> None:
         """Go on to the start of a period, counted from power-on."""
@@ -136,10 +157,20 @@ class VirtualSession:
 
     def _run(self, end_ns: int) -> None:
         while not self.ending and self.wire.now_ns < end_ns:
-            self.wire.run(min(self.wire.now_ns + SERVICE_NS, end_ns))
+            self._do_what_is_due()
+            next_ns = self._agenda[0][0] if self._agenda else end_ns
+            self.wire.run(min(self.wire.now_ns + SERVICE_NS, next_ns, end_ns))
             self._service()
             if self._options.stopped.is_set():
                 self.ending = INTERRUPTED
+
+    def _do_what_is_due(self) -> None:
+        while self._agenda and self._agenda[0][0] <= self.wire.now_ns:
+            _, _, action = heappop(self._agenda)
+            try:
+                action()
+            except ValueError as error:
+                raise BenchError(f"at bus time {self.wire.now_ns / 1e9:.6f} s: {error}") from error
 
     def _advance(self, step: Callable[[], None]) -> None:
         begin_s = time.perf_counter()

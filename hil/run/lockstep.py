@@ -120,7 +120,9 @@ class LockstepSession(VirtualSession):
     def __init__(self, rig: LockstepRig, wire: Wire, supervisor: Supervisor, begin_s: float) -> None:
         self._rig = rig
         nodes = [rig.hub.nodes[name] for name in ("plant", "controller")]
-        super().__init__(rig.options, wire, supervisor, nodes, rig.records, rig.hub.service, begin_s)
+        super().__init__(
+            rig.options, rig.contract, wire, supervisor, nodes, rig.records, rig.hub.service, begin_s
+        )
 
     def _advance(self, step: Callable[[], None]) -> None:
         try:

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from statistics import median
@@ -14,6 +14,7 @@ from dbc.node import PERIOD_NS
 from firmware_py.chosen_tuning import chosen_tuning
 from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock, Port
+from hil.faults.fault import Fault, Stage
 from hil.run.listener import Listener
 from hil.run.node_processes import MODULES, NodeProcesses, load_record
 from hil.run.options import (
@@ -195,6 +196,14 @@ class RealtimeSession:
         self._reached = 0
         self._thread = Thread(target=self._run, name="supervisor", daemon=True)
         self._thread.start()
+
+    def inject(self, fault: Fault, origin_ns: int) -> None:
+        """Have something go wrong that the sides can do themselves; see `hil.run.rig.Session`."""
+
+        def never(bus_ns: int, action: Callable[[], None]) -> None:
+            raise AssertionError("what needs this needs a wire, and is refused before")
+
+        fault.inject(Stage(self._rig.contract, self.supervisor, None, {}, never), origin_ns)
 
     def run_to(self, period: int) -> None:
         """Wait until a period, counted from power-on, has begun, and all before it is over."""

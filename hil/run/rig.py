@@ -8,8 +8,10 @@ from dataclasses import replace
 from typing import Protocol, Self
 
 from dbc.contract import Contract
+from dbc.node import PERIOD_NS
 from firmware_py.chosen_tuning import ChosenTuning
 from hil.bus.wire import Port, Wire
+from hil.faults.fault import Fault
 from hil.run.options import Recording, RigOptions, RunOptions
 from hil.scenario import PERIOD_S
 from hil.supervisor import BRING_UP_PERIODS, Supervisor
@@ -39,6 +41,15 @@ class Session(Protocol):
     @property
     def ports(self) -> Mapping[str, Port]:
         """The nodes' places on the wire; empty in real time."""
+
+    def inject(self, fault: Fault, origin_ns: int) -> None:
+        """Have something go wrong, its time counting from `origin_ns` after power-on.
+
+        Raises
+        ------
+        FaultError
+            If it cannot be had here.
+        """
 
     def run_to(self, period: int) -> None:
         """Go on to the start of a period, counted from power-on, or until something ends the run."""
@@ -121,6 +132,8 @@ def play(rig: Rig, options: RunOptions) -> Recording:
     scenario = options.scenario
     session = rig.begin(options.controller, scenario.initial_m)
     session.supervisor.plan_scenario(scenario)
+    for fault in scenario.faults:
+        session.inject(fault, BRING_UP_PERIODS * PERIOD_NS)
     end = BRING_UP_PERIODS + scenario.periods
     for period in (*range(PROGRESS_PERIODS, end, PROGRESS_PERIODS), end):
         session.run_to(period)

@@ -60,48 +60,122 @@ def test_a_scenario_file_that_is_not_there(capsys, out, tmp_path):
 GOOD = 'title = "t"\nreference = "sine"\nduration_s = 1.0\n'
 
 
+FAULT = GOOD + '[[fault]]\nkind = "sensor_bias"\nbias_m = 0.1\n\n[[fault]]\n'
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
         ("title = ", "Invalid value (at end of document)"),
         ("title = \x00", "Invalid value (at line 1, column 9)"),
         (GOOD + GOOD, "Cannot overwrite a value (at line 4"),
-        ("", "missing key 'duration_s'"),
-        ('title = "t"\nreference = "sine"\n', "missing key 'duration_s'"),
-        (GOOD + "speed = 1\n", "unknown key 'speed'"),
-        (GOOD.replace('"sine"', '"cosine"'), "'cosine' is not one of sine, lift_lower, full_stroke"),
-        (GOOD.replace('"sine"', '["sine"]'), "reference"),
-        (GOOD.replace('"t"', "1"), "title"),
-        (GOOD.replace("1.0", '"1.0"'), "duration_s is '1.0'"),
-        (GOOD.replace("1.0", "0"), "must be from 0.001 to 3600 s"),
-        (GOOD.replace("1.0", "nan"), "duration_s is nan"),
-        (GOOD.replace("1.0", "true"), "duration_s is True"),
-        (GOOD + "load = 5\n", "load must be a list of [time_s, force_n]"),
-        (GOOD + "load = [[1.0]]\n", "load must be a list of [time_s, force_n]"),
-        (GOOD + 'load = [["a", 1]]\n', "load must be a list of [time_s, force_n]"),
-        (GOOD + "load = [[nan, 1]]\n", "load"),
-        (GOOD + "load = [[1, inf]]\n", "load"),
-        (GOOD + "load = [[0.5, 1e12]]\n", "load"),
-        (GOOD + "load = [[-1, 5]]\n", "load"),
-        (GOOD + "limits = 3\n", "limits"),
-        (GOOD + "[limits]\nadrc = 3\n", "limits.adrc"),
-        (GOOD + "[limits.pid]\nrms_mm = 1\nmax_mm = 1\n", "limits.pid must be one of p, pi, adrc"),
-        (GOOD + "[limits.adrc]\nrms_mm = 1\n", "limits.adrc"),
-        (GOOD + '[limits.adrc]\nrms_mm = "a"\nmax_mm = 1\n', "limits.adrc"),
-        (GOOD + "[paper.adrc]\nrms_mm = 1\nmax_mm = []\n", "paper.adrc"),
-        (GOOD + "machine = 3\n", "machine must be a table"),
-        (GOOD + "[machine]\nmas = 1\n", "mine: machine: there is no 'mas', only mass, bulk_modulus"),
+        ("", "missing key 'title'; needed are title, reference, duration_s"),
         (
-            GOOD + "[machine]\nmass = 99\n",
-            "machine: mass is 99, must be a number from 0.1 to 10 times nominal",
+            'title = "t"\nreference = "sine"\n',
+            "line 1: missing key 'duration_s'; needed are title, reference",
         ),
-        (GOOD + "[machine]\ndelay_periods = 1.5\n", "machine: delay_periods is 1.5, must be a whole number"),
+        (GOOD + "speed = 1\n", "line 4: unknown key 'speed'; allowed are title, reference, duration_s, load"),
+        (
+            "# comment\n\n" + GOOD.replace('"sine"', '"cosine"'),
+            "line 4: reference 'cosine' is not one of sine, lift_lower, full_stroke",
+        ),
+        (GOOD.replace('"sine"', '["sine"]'), "line 2: reference"),
+        (GOOD.replace('"t"', "1"), "line 1: title is 1, must be a text"),
+        (GOOD.replace("1.0", '"1.0"'), "line 3: duration_s is '1.0', must be from 0.001 to 3600 s"),
+        (GOOD.replace("1.0", "0"), "line 3: duration_s is 0, must be from 0.001 to 3600 s"),
+        (GOOD.replace("1.0", "nan"), "line 3: duration_s is nan"),
+        (GOOD.replace("1.0", "true"), "line 3: duration_s is True"),
+        (GOOD + "load = 5\n", "line 4: load must be a list of [time_s, force_n]"),
+        (GOOD + "load = [\n[1.0]\n]\n", "line 4: load must be a list of [time_s, force_n]"),
+        (GOOD + 'load = [["a", 1]]\n', "line 4: load must be a list of [time_s, force_n]"),
+        (GOOD + "load = [[nan, 1]]\n", "line 4: load"),
+        (GOOD + "load = [[1, inf]]\n", "line 4: load"),
+        (
+            GOOD + "load = [[0.5, 1e12]]\n",
+            "line 4: load must be a list of [time_s, force_n], from 0 s on",
+        ),
+        (GOOD + "load = [[-1, 5]]\n", "line 4: load"),
+        (GOOD + "limits = 3\n", "line 4: limits is 3, must be a table by controller: p, pi, adrc"),
+        (GOOD + "[limits]\nadrc = 3\n", "line 5: limits.adrc is 3, must be a table with rms_mm and max_mm"),
+        (GOOD + "[limits.pid]\nrms_mm = 1\nmax_mm = 1\n", "line 4: limits.pid must be one of p, pi, adrc"),
+        (
+            GOOD + "[limits.adrc]\nrms_mm = 1\n",
+            "line 4: missing key 'max_mm' in limits.adrc; needed are",
+        ),
+        (
+            GOOD + "[limits.adrc]\nrms_mm = 1\nmax_mn = 1\n",
+            "line 6: unknown key 'max_mn' in limits.adrc; allowed",
+        ),
+        (
+            GOOD + '[limits.adrc]\nrms_mm = "a"\nmax_mm = 1\n',
+            "line 5: limits.adrc.rms_mm is 'a', must be a",
+        ),
+        (
+            GOOD + "[paper.adrc]\nrms_mm = 1\nmax_mm = []\n",
+            "line 6: paper.adrc.max_mm is [], must be a",
+        ),
+        (
+            GOOD + "timing = 3\n",
+            "line 4: timing is 3, must be a table of limits: feedback_age_us",
+        ),
+        (
+            GOOD + "[timing]\nlatency = 3\n",
+            "line 5: unknown key 'latency' in timing; allowed are feedback_age",
+        ),
+        (
+            GOOD + "timing.latency_us = -3\n",
+            "line 4: timing.latency_us is -3, must be a number of µs",
+        ),
+        (GOOD + "machine = 3\n", "line 4: machine is 3, must be a table"),
+        (GOOD + "[machine]\nmas = 1\n", "line 5: machine: there is no 'mas', only mass, bulk_modulus"),
+        (
+            GOOD + "[machine]\nleak = 1\nmass = 99\n",
+            "line 6: machine: mass is 99, must be a number from 0.1 to 10 times nominal",
+        ),
+        (
+            GOOD + "[machine]\ndelay_periods = 1.5\n",
+            "line 5: machine: delay_periods is 1.5, must be a whole number",
+        ),
+        (GOOD + "[fault]\n", "line 4: fault is no list: write each as a table [[fault]]"),
+        (GOOD + "fault = [1]\n", "line 4: fault[0] is 1, must be a table"),
+        (
+            FAULT + "bias_m = 0.1\n",
+            "line 8: missing key 'kind' in fault[1]; it is one of drop, delay",
+        ),
+        (FAULT + 'kind = "bias"\n', "line 9: there is no fault 'bias': choose one of drop, delay, duplicate"),
+        (FAULT + "kind = 3\n", "line 9: there is no fault 3: choose one of drop, delay, duplicate"),
+        (
+            FAULT + 'kind = "sensor_bias"\n',
+            "line 8: sensor_bias: bias_m is missing, must be a number",
+        ),
+        (
+            FAULT + 'kind = "sensor_bias"\nbias_m = 0\nbias = 1\n',
+            "line 11: sensor_bias: there is no 'bias', only at_s, duration_s, bias_m",
+        ),
+        (
+            FAULT + 'kind = "sensor_bias"\nbias_m = "a lot"\n',
+            "line 10: sensor_bias: bias_m is 'a lot', must be a number from -1 to 1 m",
+        ),
+        (
+            FAULT + 'kind = "drop"\nmessage = "Position"\n',
+            "line 10: drop: message is 'Position', must be one of DriveCommand, PositionFeedback",
+        ),
+        (
+            FAULT + 'kind = "drop"\nmessage = "DriveCommand"\ncount = 1.5\n',
+            "line 11: drop: count is 1.5, must be a whole number from 1 to 1e+06 frames",
+        ),
+        (
+            FAULT + 'kind = "signal_offset"\nmessage = "DriveCommand"\nsignal = "Position"\noffset = 1\n',
+            "line 11: signal_offset: DriveCommand has no signal 'Position': choose one of Controlword",
+        ),
     ],
 )
 def test_a_malformed_scenario_file(capsys, out, tmp_path, text, what):
+    """The line, the key, and what is allowed; a key that is missing at the top has no line."""
     file = tmp_path / "mine.toml"
     file.write_text(text)
-    assert what in refused(capsys, "run", file, "--mode", "inprocess", "--out", out)
+    line = refused(capsys, "run", file, "--mode", "inprocess", "--out", out)
+    assert f"mine.toml: {what}" in line
 
 
 def test_a_scenario_file_that_is_no_text(capsys, out, tmp_path):

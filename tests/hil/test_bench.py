@@ -51,17 +51,23 @@ def test_a_reference_may_be_a_number_or_a_function_of_either(rig):
     ("wrong", "said"),
     [
         (lambda bench: bench.corrupt("PositionFeedback", 48), "PositionFeedback has bits 0 to 47, not 48"),
-        (lambda bench: bench.corrupt("PositionFeedback", -1), "bits 0 to 47"),
-        (lambda bench: bench.drop("PositionFeedback", 0), "count is 0"),
-        (lambda bench: bench.delay("PositionFeedback", -0.001), "cannot be early"),
+        (
+            lambda bench: bench.corrupt("PositionFeedback", -1),
+            "bit is -1, must be a whole number from 0",
+        ),
+        (lambda bench: bench.drop("PositionFeedback", 0), "count is 0, must be a whole number from 1 to"),
+        (
+            lambda bench: bench.delay("PositionFeedback", -0.001),
+            "delay_s is -0.001, must be a number",
+        ),
         (lambda bench: bench.setpoint(200), "a setpoint of 200.0 m is beyond 0.999 m"),
         (lambda bench: bench.load_force(1e9), "is beyond 1e"),
         (lambda bench: bench.run(-1), "must be one period"),
         (lambda bench: bench.run(0.0004), "must be one period"),
-        (lambda bench: bench.drop("Position"), "there is no message 'Position': choose one of DriveCommand"),
+        (lambda bench: bench.drop("Position"), "message is 'Position', must be one of DriveCommand"),
         (lambda bench: bench.silence("Setpoint"), "there is no message 'Setpoint'"),
         (lambda bench: bench.signal("DriveStatus.Speed"), "DriveStatus has no signal 'Speed'"),
-        (lambda bench: bench.power_off("drive"), "there is no node 'drive': choose one of controller, plant"),
+        (lambda bench: bench.power_off("drive"), "node is 'drive', must be one of controller, plant"),
     ],
 )
 def test_what_does_not_exist_is_refused(rig, wrong, said):

@@ -1,0 +1,215 @@
+"""What a fault is: a kind, parameters with units and bounds, and a time."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
+from functools import partial
+from numbers import Real
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from dbc.contract import Contract
+from hil.bus.wire import Port, Wire
+
+if TYPE_CHECKING:
+    from hil.supervisor import Supervisor
+
+LONGEST_S = 3600.0
+_NS_PER_S = 1_000_000_000
+
+
+class FaultError(ValueError):
+    """A fault that does not exist or makes no sense; the message says what is allowed.
+
+    Attributes
+    ----------
+    key : str
+        The parameter concerned; empty if none is.
+    """
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
+
+
+def number(low: float, high: float, unit: str, default: Any = MISSING) -> Any:
+    """Return a field for a number within closed bounds, in a unit."""
+    return field(default=default, metadata={"bounds": (low, high), "unit": unit})
+
+
+def choice(*names: str, default: Any = MISSING) -> Any:
+    """Return a field for one of some names."""
+    return field(default=default, metadata={"choices": names})
+
+
+def name(of_what: str) -> Any:
+    """Return a field for a name that other parameters decide on."""
+    return field(metadata={"name": of_what})
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What faults act on.
+
+    Attributes
+    ----------
+    contract : Contract
+        The DBC.
+    supervisor : Supervisor or None
+        Sends what goes over the bench channel; None on a bus that has none of ours.
+    wire : Wire or None
+        The simulated bus; None on a real one.
+    ports : mapping of str to Port
+        The places of nodes in virtual time, by name.
+    at : callable
+        Takes a bus time (ns) and an action, and has it done then, before the wire's own events.
+    """
+
+    contract: Contract
+    supervisor: "Supervisor | None"
+    wire: Wire | None
+    ports: Mapping[str, Port]
+    at: Callable[[int, Callable[[], None]], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """Something that goes wrong at a time.
+
+    Each field's metadata holds ``unit`` and closed ``bounds``, or ``choices``.
+
+    Parameters
+    ----------
+    at_s : float
+        When, in s: from the scenario's start, or from now when it is injected into a run.
+
+    Raises
+    ------
+    FaultError
+        One line that names the parameter, its value and what is allowed.
+    """
+
+    kind: ClassVar[str]
+    needs_virtual_time: ClassVar[bool] = True
+
+    at_s: float = number(0.0, LONGEST_S, "s", default=0.0)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            object.__setattr__(self, item.name, _checked(self.kind, item, getattr(self, item.name)))
+
+    @abstractmethod
+    def inject(self, stage: Stage, origin_ns: int) -> None:
+        """Have it happen `at_s` after bus time `origin_ns`.
+
+        Raises
+        ------
+        FaultError
+            If it cannot be had there.
+        """
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """Kind, time and parameters as in a scenario file, without what is at its default."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        defaults = {item.name: item.default for item in fields(self) if item.name != "at_s"}
+        return {"kind": self.kind} | {
+            key: value for key, value in values.items() if defaults.get(key, MISSING) != value
+        }
+
+    @property
+    def text(self) -> str:
+        """The fault as a command line takes it."""
+        kind, *parameters = self.table.items()
+        return ",".join([kind[1], *(f"{key}={value}" for key, value in parameters)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireFault(Fault):
+    """One that is brought about on the simulated wire."""
+
+    def inject(self, stage: Stage, origin_ns: int) -> None:
+        """Have it begin `at_s` after bus time `origin_ns`."""
+        self.check(stage)
+        stage.at(self.begin_ns(origin_ns), partial(self.begin, stage))
+
+    def begin_ns(self, origin_ns: int) -> int:
+        """Return the bus time at which it begins, ns."""
+        return origin_ns + round(self.at_s * _NS_PER_S)
+
+    @property
+    def concerned(self) -> str:
+        """The node that has to be there; nothing if none has."""
+        return str(getattr(self, "node", ""))
+
+    def check(self, stage: Stage) -> None:
+        """Refuse what cannot be had there."""
+        self.wire(stage)
+        if self.concerned:
+            self.port(stage, self.concerned)
+
+    def wire(self, stage: Stage) -> Wire:
+        """Return the simulated wire."""
+        if stage.wire is None:
+            raise FaultError(f"{self.kind} needs virtual time: use mode inprocess or lockstep")
+        return stage.wire
+
+    def port(self, stage: Stage, node: str) -> Port:
+        """Return a node's place on the wire."""
+        if node not in stage.ports:
+            raise FaultError(f"{self.kind} needs the {node} in virtual time: inject it into a lock-step run")
+        return stage.ports[node]
+
+    @abstractmethod
+    def begin(self, stage: Stage) -> None:
+        """Do what has to be done when it begins."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LastingWireFault(WireFault):
+    """One that ends by itself.
+
+    Parameters
+    ----------
+    duration_s : float
+        How long it lasts, s; to the end of the run if not given.
+    """
+
+    duration_s: float = number(1e-6, math.inf, "s", default=math.inf)
+
+    def inject(self, stage: Stage, origin_ns: int) -> None:
+        """Have it begin `at_s` after bus time `origin_ns`, and end."""
+        WireFault.inject(self, stage, origin_ns)
+        if self.duration_s < math.inf:
+            end_ns = self.begin_ns(origin_ns) + round(self.duration_s * _NS_PER_S)
+            stage.at(end_ns, partial(self.end, stage))
+
+    @abstractmethod
+    def end(self, stage: Stage) -> None:
+        """Do what has to be done when it ends."""
+
+
+def allowed(item: "Field[Any]") -> str:
+    """Return what a parameter may be, in words."""
+    if of_what := item.metadata.get("name"):
+        return f"the name of {of_what}"
+    if choices := item.metadata.get("choices"):
+        return f"one of {', '.join(choices)}"
+    (low, high), unit = item.metadata["bounds"], item.metadata["unit"]
+    kind = "a whole number" if item.type is int else "a number"
+    upper = "on" if high == math.inf else f"to {high:g}"
+    return f"{kind} from {low:g} {upper} {unit}".rstrip()
+
+
+def _checked(kind: str, item: "Field[Any]", value: Any) -> Any:
+    if "name" in item.metadata:
+        good = isinstance(value, str)
+    elif choices := item.metadata.get("choices"):
+        good = isinstance(value, str) and value in choices
+    else:
+        low, high = item.metadata["bounds"]
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        good = is_number and low <= value <= high and (item.type is not int or value == int(value))
+    if not good:
+        raise FaultError(f"{kind}: {item.name} is {value!r}, must be {allowed(item)}", item.name)
+    return item.type(value) if callable(item.type) else value
