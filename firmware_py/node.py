@@ -1,5 +1,6 @@
 """The controller node: what its timer and receive interrupts do. Integers only."""
 
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,10 @@ from dbc.frame import Frame
 from dbc.jit import entry_point
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
+from dbc.packet import HEAD_DLC, NOT_ANSWERED, answer_by_entry_points, append_frame, event_ns
 from dbc.record import Record
 from firmware_py import mailbox, task
+from firmware_py.answer import answer_timer
 from firmware_py.calibration import Calibration, CalibrationError
 from firmware_py.kernel import layout as k
 
@@ -31,6 +34,7 @@ _PLAUSIBLE_POSITION_UM = -10_000, 410_000
 _PLAUSIBLE_SETPOINT_0P1UM = -10_000, 4_010_000
 _USABLE_SENSOR_STATUS = 0, 1
 _period, _receive = entry_point(task.period), entry_point(mailbox.receive)
+_answer_timer = entry_point(answer_timer)
 
 
 class Controller:
@@ -66,22 +70,39 @@ class Controller:
             contract.controller_command: {},
             contract.drive_status: {},
         }
-        self._received_ids = [message.can_id for message in received]
         self._expectations = np.array([mailbox.expectation(*entry) for entry in received.items()])
-        self.accepts = frozenset({*self._received_ids, contract.bench_control.can_id})
+        self._mailboxes = mailbox.empty(self._expectations)
+        received_ids = [message.can_id for message in received]
+        self._rows = dict(zip(received_ids, self._mailboxes, strict=True))
+        self.accepts = frozenset({*received_ids, contract.bench_control.can_id})
         self.latched = self.accepts
         self.transmits = frozenset(
             message.can_id
             for message in (contract.drive_command, contract.controller_status, contract.observer_state)
         )
-        self._layout = contract.drive_command.protected_layout()
+        self._task = np.zeros(task.TASK_SIZE, np.int64)
+        self._kernel_state = np.zeros(k.ST_SIZE, np.int32)
+        self._io = np.zeros(k.IO_SIZE, np.int32)
+        self._calibration = np.zeros(k.CAL_SIZE, np.int32)
         self._row = np.zeros(len(task.RECORD_COLUMNS), np.int64)
-        self.record = Record(task.RECORD_COLUMNS, "q")
+        arrays = (
+            self._mailboxes,
+            self._expectations,
+            contract.drive_command.protected_layout(),
+            self._task,
+            self._calibration,
+            self._kernel_state,
+            self._io,
+        )
+        self._period = partial(_period, *arrays, self._row)
+        ids = np.array(received_ids)
+        command_head = contract.drive_command.can_id | contract.drive_command.dlc << HEAD_DLC
+        self._answer_timer = partial(_answer_timer, ids, command_head, EXECUTION_NS, *arrays)
+        self.record = Record(task.RECORD_COLUMNS, np.int64)
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: forget everything, check the calibration."""
-        self._empty_mailboxes()
-        self._restart_task()
+        self._restart()
         return Actions(next_period(now_ns))
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
@@ -90,54 +111,46 @@ class Controller:
         if row is not None:
             _receive(row, frame.data, frame.dlc)
         elif self._contract.bench_control.unpack(frame.data).command == BenchCommand.RESET:
-            self._empty_mailboxes()
-            self._bench_reset = True
+            self._restart()
         return NOTHING
 
     def on_timer(self, now_ns: int) -> Actions:
         """Timer interrupt: one control period."""
-        if self._bench_reset:
-            self._restart_task()
         payload = self._period(now_ns)
-        self.record.append_array(self._row)
+        self.record.append(self._row)
         send_ns = now_ns + EXECUTION_NS
-        sends = [(send_ns, self._drive_command.frame(payload))]
+        frames = [self._drive_command.frame(payload), *self._other_frames()]
+        return Actions(next_period(now_ns + 1), tuple((send_ns, frame) for frame in frames))
+
+    def answer(self, packet: memoryview, answer: bytearray) -> int:
+        """Do all that an event asks for in one call; see `dbc.packet`."""
+        length: int = self._answer_timer(self.record.rows, self.record.count, packet, answer)
+        if length == NOT_ANSWERED:
+            return answer_by_entry_points(self, packet, answer)
+        for frame in self._other_frames():
+            length = append_frame(answer, length, event_ns(packet) + EXECUTION_NS, frame)
+        return length
+
+    def _other_frames(self) -> list[Frame]:
+        """Return what is sent beside DriveCommand in this period."""
+        frames = []
         if self._cycle % _STATUS_PERIODS == 0:
-            sends.append((send_ns, self._status_frame()))
+            frames.append(self._status_frame())
         if self._cycle % _OBSERVER_PERIODS == _OBSERVER_PHASE:
-            sends.append((send_ns, self._observer_frame()))
+            frames.append(self._observer_frame())
         self._cycle += 1
-        return Actions(next_period(now_ns + 1), tuple(sends))
+        return frames
 
-    def _empty_mailboxes(self) -> None:
-        self._mailboxes = mailbox.empty(self._expectations)
-        self._rows = dict(zip(self._received_ids, self._mailboxes, strict=True))
-
-    def _restart_task(self) -> None:
-        self._task = np.zeros(task.TASK_SIZE, np.int64)
-        self._kernel_state = np.zeros(k.ST_SIZE, np.int32)
-        self._io = np.zeros(k.IO_SIZE, np.int32)
-        self._bench_reset = False
+    def _restart(self) -> None:
+        self._mailboxes[:] = mailbox.empty(self._expectations)
+        for words in (self._task, self._kernel_state, self._io, self._calibration):
+            words[:] = 0
         self._cycle = 0
-        try:
+        with suppress(CalibrationError):
             calibration = Calibration.from_bytes(self._calibration_block)
-        except CalibrationError:
-            self._calibration = np.zeros(k.CAL_SIZE, np.int32)
-        else:
-            self._calibration = calibration.array()
+            self._calibration[:] = calibration.array()
             self._task[task.IS_CALIBRATED] = 1
             self._task[task.DEFAULT_LAW] = calibration.law
-        self._period = partial(
-            _period,
-            self._mailboxes,
-            self._expectations,
-            self._layout,
-            self._task,
-            self._calibration,
-            self._kernel_state,
-            self._io,
-            self._row,
-        )
 
     def _status_frame(self) -> Frame:
         status = self._contract.controller_status

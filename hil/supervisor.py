@@ -69,7 +69,7 @@ class Supervisor:
     def __init__(self, contract: Contract, controller: str, position_m: float = 0.0) -> None:
         if controller not in CONTROLLERS:
             raise ValueError(f"there is no controller {controller!r}: choose one of {', '.join(CONTROLLERS)}")
-        self.record = Record(("time_ns", "reference_m", "setpoint_raw", "load_n"), "d")
+        self.record = Record(("time_ns", "reference_m", "setpoint_raw", "load_n"), np.float64)
         self.start_ns = 0
         self.next_period = 0
         self.silent: set[int] = set()

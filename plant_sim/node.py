@@ -11,7 +11,9 @@ from dbc.frame import Frame
 from dbc.jit import entry_point
 from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
+from dbc.packet import HEAD_DLC, NOT_ANSWERED, answer_by_entry_points, append_frame, event_ns
 from dbc.record import Record
+from plant_sim.answer import answer_timer
 from plant_sim.drive import COUNTS_PER_RPM, Drive
 from plant_sim.equilibrium import initial_state
 from plant_sim.parameters import PlantParameters
@@ -34,7 +36,7 @@ _RESET_LSB_M = 1e-7
 _COUNTS_PER_UNIT = 1e6
 _MAX_LOAD_N = 1e6
 _FAULTS, _PARAMETERS = frozenset(BenchFault), frozenset(BenchParameter)
-_run_period = entry_point(run_period)
+_run_period, _answer_timer = entry_point(run_period), entry_point(answer_timer)
 
 
 class Plant:
@@ -94,19 +96,19 @@ class Plant:
         self._feedback_layout = contract.position_feedback.protected_layout()
         self._feedback = contract.position_feedback
         self._command_dlc = contract.drive_command.dlc
-        self.record = Record(COLUMNS, "d")
+        self.record = Record(COLUMNS, np.float64)
+        self.on_start(0)
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: at rest, retracted, drive off."""
-        contract = self._contract
         self._receiver = np.zeros(e2e.STATE_SIZE, np.int64)
         self._feedback_counter = np.zeros(1, np.int64)
-        self._protect_status = contract.drive_status.protector().protect
+        self._protect_status = self._contract.drive_status.protector().protect
         self._command_frame: Frame | None = None
         self._bench_frames: list[Frame] = []
-        self._time_ns = next_period(now_ns)
-        self._restart(0.0)
-        return Actions(self._time_ns)
+        first_ns = next_period(now_ns)
+        self._restart(0.0, first_ns)
+        return Actions(first_ns)
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
         """Latch: the newest command, and all that the bench asks for."""
@@ -119,23 +121,37 @@ class Plant:
     def on_timer(self, now_ns: int) -> Actions:
         """Simulate up to now, send what the sensors say, and let the drive take its command."""
         is_rescaled = self._take_bench_frames(now_ns) if self._bench_frames else False
-        periods = (now_ns - self._time_ns) // PERIOD_NS
-        self._time_ns += periods * PERIOD_NS
+        periods = (now_ns - int(self._row[TIME])) // PERIOD_NS
         frame, self._command_frame = self._command_frame, None
         arrived = frame is not None and frame.dlc == self._command_dlc
         data = frame.data if frame is not None else 0
         payload = self._run_period(periods, data, arrived, self._sensor.error_m(now_ns))
-        self.record.append_array(self._row)
+        self.record.append(self._row)
         if is_rescaled:
             scales = {parameter.name.lower(): factor for parameter, factor in self._scales.items()}
             self._vector[:] = self._parameters.scaled_within_bounds(**scales).vector()
-        sends = [] if self._sensor.is_silent else [(now_ns, self._feedback.frame(payload))]
-        phase = self._time_ns // PERIOD_NS % _STATUS_PERIODS
+        frames = () if self._sensor.is_silent else (self._feedback.frame(payload),)
+        sends = tuple((now_ns, frame) for frame in (*frames, *self._other_frames(now_ns)))
+        return Actions(int(self._row[TIME]) + PERIOD_NS, sends)
+
+    def answer(self, packet: memoryview, answer: bytearray) -> int:
+        """Do all that an event asks for in one call; see `dbc.packet`."""
+        length = NOT_ANSWERED
+        if self._sensor.is_plain and self._command_frame is None and not self._bench_frames:
+            length = self._answer_timer(self.record.rows, self.record.count, packet, answer)
+        if length == NOT_ANSWERED:
+            return answer_by_entry_points(self, packet, answer)
+        now_ns = event_ns(packet)
+        for frame in self._other_frames(now_ns):
+            length = append_frame(answer, length, now_ns, frame)
+        return length
+
+    def _other_frames(self, now_ns: int) -> tuple[Frame, ...]:
+        """Return what is sent beside PositionFeedback in this period."""
+        phase = now_ns // PERIOD_NS % _STATUS_PERIODS
         if phase == _STATUS_PHASE:
-            sends.append((now_ns, self._status_frame()))
-        elif phase == _PRESSURE_PHASE:
-            sends.append((now_ns, self._pressure_frame()))
-        return Actions(self._time_ns + PERIOD_NS, tuple(sends))
+            return (self._status_frame(),)
+        return (self._pressure_frame(),) if phase == _PRESSURE_PHASE else ()
 
     def _status_frame(self) -> Frame:
         status = self._contract.drive_status
@@ -147,7 +163,7 @@ class Plant:
         pressures_pa = self._row[PRESSURE_A : PRESSURE_ACCUMULATOR + 1].tolist()
         return pressure.frame(pressure.pack(*map(pressure_count, pressures_pa)))
 
-    def _restart(self, position_m: float) -> None:
+    def _restart(self, position_m: float, time_ns: float) -> None:
         parameters = self._parameters
         self._state = initial_state(parameters, position_m)
         self._vector = parameters.vector()
@@ -157,9 +173,8 @@ class Plant:
             parameters.motor_speed_rpm, parameters.motor_acceleration_rad_s2, self._delay_periods
         )
         self._row = np.zeros(len(COLUMNS))
-        self._row[TIME] = self._time_ns
-        self._run_period = partial(
-            _run_period,
+        self._row[TIME] = time_ns
+        arrays = (
             self._state,
             self._vector,
             self._row,
@@ -170,6 +185,9 @@ class Plant:
             self._feedback_layout,
             self._sensor.words,
         )
+        self._run_period = partial(_run_period, *arrays)
+        feedback_head = self._feedback.can_id | self._feedback.dlc << HEAD_DLC
+        self._answer_timer = partial(_answer_timer, self._command_id, feedback_head, *arrays)
 
     def _take_bench_frames(self, now_ns: int) -> bool:
         """Do what the bench asked for; return whether a parameter is to be scaled after this period."""
@@ -184,7 +202,7 @@ class Plant:
             asked = control.unpack(frame.data)
             if asked.command == BenchCommand.RESET:
                 position_m = asked.value * _RESET_LSB_M
-                self._restart(min(max(position_m, 0.0), self._parameters.stroke_m))
+                self._restart(min(max(position_m, 0.0), self._parameters.stroke_m), self._row[TIME])
                 is_rescaled = False
             elif asked.command == BenchCommand.SET_FAULT and asked.identifier in _FAULTS:
                 self._sensor.set_fault(BenchFault(asked.identifier), asked.value / _COUNTS_PER_UNIT, now_ns)

@@ -62,6 +62,8 @@ class PositionSensor:
         What `reported_um` works on.
     is_silent : bool
         Whether nothing is reported.
+    is_plain : bool
+        Whether it reports, and without an error before quantisation.
 
     Raises
     ------
@@ -126,6 +128,7 @@ class PositionSensor:
         self._drift_m_s = faults[BenchFault.SENSOR_DRIFT]
         self._total_noise_rms_m = math.hypot(self._noise_rms_m, faults[BenchFault.SENSOR_NOISE])
         self._is_exact = not (self._bias_m or self._drift_m_s or self._total_noise_rms_m)
+        self.is_plain = self._is_exact and not self.is_silent
 
 
 def pressure_count(pressure_pa: float) -> int:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dbc.frame import Frame
+from dbc.packet import pack_event
 from hil.bus import link
 from hil.bus.link import LinkError
 from hil.bus.wire import NEVER, Clock, Port, Wire
@@ -78,16 +79,16 @@ class RemoteNode:
 
     def save(self) -> None:
         """Let the process write its record now."""
-        self.ask(link.pack_event(link.SAVE), bytearray(link.MAX_PACKET))
+        self.ask(pack_event(link.SAVE), bytearray(link.MAX_PACKET))
 
     def forget(self) -> None:
         """Let the process begin its record anew."""
-        self.ask(link.pack_event(link.FORGET), bytearray(link.MAX_PACKET))
+        self.ask(pack_event(link.FORGET), bytearray(link.MAX_PACKET))
 
     def stop(self) -> None:
         """Tell the process to write its record and end."""
         with suppress(OSError):  # it may have ended by itself
-            self._link.send(link.pack_event(link.STOP))
+            self._link.send(pack_event(link.STOP))
         self._link.close()
 
 

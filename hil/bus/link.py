@@ -3,7 +3,7 @@
 Frames keep SocketCAN's 16-byte layout. A participant says hello in JSON and is answered in JSON; after that
 
 - a *bus* participant (any python-can program) sends frames and receives frames with their bus time;
-- a *node* in virtual time receives one event at a time and answers each with its actions.
+- a *node* in virtual time receives one event at a time and answers each (`dbc.packet`).
 """
 
 import json
@@ -16,19 +16,15 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from dbc.frame import EFF_FLAG, Frame
-from dbc.node import NOTHING, Actions, Node
 
 PROTOCOL_VERSION = 2
 MAX_PACKET = 65536
-START, TIMER, FRAME, STOP, SAVE, FORGET = range(6)
-NO_WAKE = -(1 << 63)
+STOP, SAVE, FORGET = range(3, 6)
+"""What a node is told beside events: to write its record and end, to write it, to begin it anew."""
 
 _FRAME = struct.Struct("<IB3xQ")
 _TIMED_FRAME = struct.Struct("<qIB3xQ")
 TIMED_FRAME_BYTES = _TIMED_FRAME.size
-_EVENT = struct.Struct("<qq")
-_WAKE = struct.Struct("<q")
-_WAKE_AND_FRAME = struct.Struct("<qqIB3xQ")
 
 
 class LinkError(Exception):
@@ -88,59 +84,6 @@ class Askable(Protocol):
 
     def late_answer(self, answer: bytearray) -> int:
         """Wait for the answer to a packet that the wire has sent itself, and return it like `ask`."""
-
-
-def pack_event(kind: int, now_ns: int = 0) -> bytes:
-    """Return an event without frames."""
-    return _EVENT.pack(kind, now_ns)
-
-
-def deliver(node: Node, packet: memoryview) -> Actions:
-    """Call a node's entry points for an event and the frames that come with it; return its actions.
-
-    The packet is kind and node time (ns), then the frames, each behind its own time.
-    """
-    kind, now_ns = _EVENT.unpack_from(packet)
-    actions = NOTHING
-    if len(packet) > _EVENT.size:
-        new, on_frame = tuple.__new__, node.on_frame  # new: a third of the cost of Frame(...)
-        for time_ns, *frame in _TIMED_FRAME.iter_unpack(packet[_EVENT.size :]):
-            actions = on_frame(time_ns, new(Frame, frame))
-    if kind == TIMER:
-        return node.on_timer(now_ns)
-    if kind == START:
-        return node.on_start(now_ns)
-    return actions
-
-
-def pack_actions_into(answer: bytearray, actions: Actions) -> int:
-    """Put a node's answer to an event into `answer`; return its length in bytes.
-
-    It is when the node wants to wake, or `NO_WAKE`, then the frames, each behind its send time.
-    """
-    wake_ns, sends = actions
-    if wake_ns is None:
-        wake_ns = NO_WAKE
-    if len(sends) == 1:  # by far the most frequent
-        send_ns, frame = sends[0]
-        _WAKE_AND_FRAME.pack_into(answer, 0, wake_ns, send_ns, *frame)
-        return _WAKE_AND_FRAME.size
-    _WAKE.pack_into(answer, 0, wake_ns)
-    at = _WAKE.size
-    for send_ns, frame in sends:
-        _TIMED_FRAME.pack_into(answer, at, send_ns, *frame)
-        at += _TIMED_FRAME.size
-    return at
-
-
-def unpack_actions(answer: bytearray, length: int) -> Actions:
-    """Return the actions that `pack_actions_into` has put into the first bytes of `answer`."""
-    if not length:
-        return NOTHING
-    (wake_ns,) = _WAKE.unpack_from(answer)
-    frames = _TIMED_FRAME.iter_unpack(memoryview(answer)[_WAKE.size : length])
-    sends = tuple((send_ns, Frame(*frame)) for send_ns, *frame in frames)
-    return Actions(None if wake_ns == NO_WAKE else wake_ns, sends)
 
 
 def socket_directory() -> Path:

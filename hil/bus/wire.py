@@ -14,7 +14,8 @@ import numpy as np
 
 from dbc.frame import Frame
 from dbc.jit import entry_point
-from dbc.node import NOTHING, Actions, Node
+from dbc.node import Actions, Node
+from dbc.packet import START, answers_of, pack_actions_into, unpack_actions
 from hil.bus import confinement, link
 from hil.bus import wire_core as at
 from hil.bus.wire_core import NEVER, arbitration_key
@@ -93,12 +94,7 @@ class LocalNode:
     def __init__(self, node: Node) -> None:
         self.name, self.accepts, self.latched = node.name, node.accepts, node.latched
         self.link = at.NO_LINK
-        self._node = node
-
-    def ask(self, packet: memoryview, answer: bytearray) -> int:
-        """Put the node's answer to an event into `answer`; return its length in bytes, 0 for none."""
-        actions = link.deliver(self._node, packet)
-        return 0 if actions is NOTHING else link.pack_actions_into(answer, actions)
+        self.ask = answers_of(node)
 
     def late_answer(self, answer: bytearray) -> int:
         """Never be needed: there is no link."""
@@ -254,7 +250,7 @@ class Wire:
         words = self._mail[port.order]
         self._port_words[port.order, confinement.TEC :] = 0
         self._make_room()
-        words[: at.FRAMES] = link.START, port.clock.local(self.now_ns)
+        words[: at.FRAMES] = START, port.clock.local(self.now_ns)
         self._port_words[port.order, at.MAILED] = 0
         length = port.ask(port.packet[: at.FRAMES * 8], self._answer)
         self._go_on(length, port.order, self.now_ns)
@@ -454,10 +450,10 @@ class Wire:
 
     def _ask_and_edit(self, port: Port, packet: memoryview, answer: bytearray) -> int:
         self._port_words[port.order, at.EXCHANGES] += port.node.link != at.NO_LINK
-        actions = link.unpack_actions(answer, port.node.ask(packet, answer))
+        actions = unpack_actions(answer, port.node.ask(packet, answer))
         for edit in (*port.edits,):
             actions = edit(actions)
-        return link.pack_actions_into(answer, actions)
+        return pack_actions_into(answer, actions)
 
     def _unheard(self, actions: Actions) -> Actions:
         """Take away what a node sends over the bus; the bench channel is none."""

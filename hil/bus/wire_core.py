@@ -12,6 +12,7 @@ from numba.extending import register_jitable
 
 from dbc.frame import EFF_FLAG, ERR_FLAG
 from dbc.jit import njit
+from dbc.packet import FRAME, FRAME_WORDS, FRAMES, ID_MASK, KIND, NO_WAKE, TIME, TIMER
 from hil.bus.confinement import (
     ERROR_DELIMITER_BITS,
     ERROR_FLAG_BITS,
@@ -28,12 +29,11 @@ from hil.bus.confinement import (
     is_passive,
     next_random,
 )
-from hil.bus.link import FRAME, MAX_PACKET, NO_WAKE, TIMER
+from hil.bus.link import MAX_PACKET
 from hil.bus.wire_time import ERROR_BITS_BYTE, INTERMISSION_BITS, classic_bits
 
 NEVER = 1 << 62
 _NS_PER_S = 1_000_000_000
-_ID_MASK = 0xFFFF_FFFF
 
 # words of the wire
 (
@@ -83,9 +83,7 @@ QUEUE_SIZE = 7
 LOG_TIME, LOG_HEAD, LOG_DATA, LOG_SENDER = range(4)
 LOG_SIZE = 4
 
-# a port's mail, which is the packet it is asked with: kind, its own time, then three words for each frame
-KIND, TIME, FRAMES = range(3)
-FRAME_WORDS = 3
+# a port's mail is the packet it is asked with, see `dbc.packet`
 MAX_MAIL_FRAMES = 1024
 MAIL_SIZE = FRAMES + MAX_MAIL_FRAMES * FRAME_WORDS
 MAX_ANSWER_FRAMES = MAX_PACKET // (8 * FRAME_WORDS)
@@ -148,7 +146,7 @@ def _deliver(core, ports, filters, log, mail, head, data, sender):  # type: igno
     row = log[core[LOGGED]]
     row[LOG_TIME], row[LOG_HEAD], row[LOG_DATA], row[LOG_SENDER] = now_ns, head, data, sender
     core[LOGGED] += 1
-    can_id = head & _ID_MASK
+    can_id = head & ID_MASK
     served = sender
     for entry in range(core[FILTERS]):
         port = filters[entry, FILTER_PORT]
@@ -211,10 +209,11 @@ def _suspended_until(core, ports, sender):  # type: ignore[no-untyped-def]
 def _bad_bit(core, faults, can_id, bits):  # type: ignore[no-untyped-def]
     """Return at which bit the frame that begins is destroyed, -1 if it is not."""
     for number in range(faults.shape[0]):
-        fault = faults[number]
-        if fault[FAULT_COUNT] and fault[FAULT_KIND] == DESTROY and fault[FAULT_ID] == can_id:
-            fault[FAULT_COUNT] -= 1
-            return min(fault[FAULT_ARGUMENT], bits - 1)
+        if faults[number, FAULT_COUNT] == 0 or faults[number, FAULT_ID] != can_id:
+            continue
+        if faults[number, FAULT_KIND] == DESTROY:
+            faults[number, FAULT_COUNT] -= 1
+            return min(faults[number, FAULT_ARGUMENT], bits - 1)
     if core[NOW] < core[NOISE_UNTIL]:
         state, uniform = next_random(np.uint64(core[NOISE_STATE]))
         core[NOISE_STATE] = np.int64(state)
@@ -242,10 +241,10 @@ def _arbitrate(core, ports, queue, faults):  # type: ignore[no-untyped-def]
             winner = entry
     row = _take(core, queue, winner)
     head = row[HEAD]
-    bits = classic_bits(head & _ID_MASK, head >> 32, np.uint64(row[DATA]))
+    bits = classic_bits(head & ID_MASK, head >> 32, np.uint64(row[DATA]))
     core[ON_WIRE_HEAD], core[ON_WIRE_DATA], core[ON_WIRE_SENDER] = head, row[DATA], row[SENDER]
     core[ON_WIRE_READY], core[ON_WIRE_ORDER] = row[READY], row[ORDER]
-    bad_bit = _bad_bit(core, faults, head & _ID_MASK, bits - INTERMISSION_BITS)
+    bad_bit = _bad_bit(core, faults, head & ID_MASK, bits - INTERMISSION_BITS)
     core[ON_WIRE_BAD_BITS] = 0
     if bad_bit >= 0:
         core[ON_WIRE_BAD_BITS] = bad_bit + 1 + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS
@@ -259,7 +258,7 @@ def _enqueue(core, queue, ready_ns, sender, head, data):  # type: ignore[no-unty
     """Let a frame take part in arbitration from `ready_ns` on."""
     row = queue[core[QUEUED]]
     row[READY], row[SENDER], row[ORDER], row[HEAD], row[DATA] = ready_ns, sender, core[SEQUENCE], head, data
-    row[KEY] = arbitration_key(head & _ID_MASK)
+    row[KEY] = arbitration_key(head & ID_MASK)
     row[OUT_OF_BAND] = 0
     core[QUEUED] += 1
     core[SEQUENCE] += 1
@@ -358,14 +357,16 @@ def next_event_ns(core, ports, queue):  # type: ignore[no-untyped-def]
 
 @register_jitable
 def _hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, data):  # type: ignore[no-untyped-def]
-    can_id = head & _ID_MASK
+    can_id = head & ID_MASK
     if core[BUS_OFF] and sender < core[PORTS]:
         _let_recover(core, ports)
         if ports[sender, SEQUENCES_LEFT]:
             return
     for number in range(faults.shape[0]):
+        if faults[number, FAULT_COUNT] == 0 or faults[number, FAULT_ID] != can_id:
+            continue
         fault = faults[number]
-        if fault[FAULT_COUNT] == 0 or fault[FAULT_ID] != can_id or fault[FAULT_KIND] == DESTROY:
+        if fault[FAULT_KIND] == DESTROY:
             continue
         fault[FAULT_COUNT] -= 1
         if fault[FAULT_KIND] == DROP:
@@ -410,7 +411,7 @@ def _next_question(core, ports, filters, queue, log, mail, faults, until_ns):  #
 
 @njit(
     "void(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], int64, int64, int64, int64)",
-    depends=("dbc.frame", "hil.bus.confinement", "hil.bus.link"),
+    depends=("dbc.frame", "hil.bus.confinement", "hil.bus.link", "dbc.packet"),
 )
 def hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, data):  # type: ignore[no-untyped-def]
     """Hand a frame to its sender's CAN controller at bus time `ready_ns`; bus-off ones take none."""
@@ -441,7 +442,7 @@ def _exchange(ports, mail, answer, port, length):  # type: ignore[no-untyped-def
 @njit(
     "int64(int64[::1], int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1],"
     " int64[:,::1], int64[:,::1], int64[:,::1], int64, int64, int64)",
-    depends=("hil.bus.confinement", "hil.bus.wire_time", "hil.bus.link", "dbc.frame"),
+    depends=("hil.bus.confinement", "hil.bus.wire_time", "hil.bus.link", "dbc.frame", "dbc.packet"),
 )
 def advance(  # type: ignore[no-untyped-def]
     core, ports, mail, faults, out_of_band, answer, filters, queue, log, length, port, until_ns

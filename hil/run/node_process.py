@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import can
 
 from dbc.contract import ContractError
-from dbc.node import Node
+from dbc.node import NOTHING, Node
+from dbc.packet import answers_of, pack_actions_into
 from dbc.record import Record
 from hil.bus import link
 from hil.bus.hilbus import HilBus
@@ -105,6 +106,7 @@ def serve(node: RecordingNode, connection: socket.socket, channel: str, record: 
     """
     packet, answer = memoryview(bytearray(link.MAX_PACKET)), bytearray(link.MAX_PACKET)
     view, receive, send = memoryview(answer), connection.recv_into, connection.send
+    answer_to = answers_of(node)
     with connection:
         while True:
             try:
@@ -122,7 +124,8 @@ def serve(node: RecordingNode, connection: socket.socket, channel: str, record: 
                 node.record.save(record / f"{node.name}.npz")
             elif kind == link.FORGET:
                 node.record.clear()
-            send(view[: link.pack_actions_into(answer, link.deliver(node, packet[:length]))])
+            length = answer_to(packet[:length], answer) or pack_actions_into(answer, NOTHING)
+            send(view[:length])
 
 
 def _attach(channel: str, node: Node) -> tuple[socket.socket, dict[str, Any]]:
