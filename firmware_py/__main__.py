@@ -3,6 +3,7 @@
 import argparse
 import sys
 
+import hil.bus.mf4_on_demand  # noqa: F401  before python-can is imported
 from dbc.contract import Contract
 from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from firmware_py.node import PHASE_NS, Controller

@@ -7,6 +7,7 @@ import sys
 def main() -> int:
     """Run the command line; an interrupt while it is being loaded ends it quietly."""
     try:
+        import hil.bus.mf4_on_demand  # noqa: F401  before python-can is imported
         from hil.cli import main as run  # compiles the plant and the kernel when they have changed
 
         return run()

@@ -45,7 +45,7 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, controller_of, load_scenario
-from hil.study import reproduce, rta_command, sweep_command, tune_command
+from hil.study import replay_command, reproduce, rta_command, sweep_command, tune_command
 from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
@@ -118,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
-    run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .trc ...")
+    run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .mf4 ...")
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
     run.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; -i: adapter's)")
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
@@ -151,6 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     status.set_defaults(command=_vcan_status)
 
     reproduce.add_command(commands)
+    replay_command.add_command(commands)
     rta_command.add_command(commands)
 
     listing = commands.add_parser("list", help="list the built-in scenarios and tunings")

@@ -8,12 +8,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-import can
 import numpy as np
 from can.io.logger import MESSAGE_WRITERS
 
-from dbc.frame import Frame
-from hil.bus.messages import to_message
+from hil.bus_log import check_log_format, write_bus_log
 from hil.measure import M_TO_MM, Trace
 from hil.run.options import BenchError
 
@@ -85,16 +83,9 @@ class OutputDirectory(ResultFolder):
     """
 
     def __init__(self, path: Path, log_format: str) -> None:
-        if log_format not in MESSAGE_WRITERS:
-            known = ", ".join(sorted(MESSAGE_WRITERS))
-            raise BenchError(f"no bus log can be written as {log_format!r}: choose one of {known}")
+        check_log_format(log_format)
         super().__init__(path)
         self._log_format = log_format
-        try:
-            write_bus_log(self.scratch / f"probe{log_format}", np.empty((0, 4), np.uint64))
-        except (ImportError, NotImplementedError) as error:  # a package that this format needs is missing
-            self._clean_up()
-            raise BenchError(f"no bus log can be written as {log_format!r}: {error}") from error
 
     def write(self, result: dict[str, Any], trace: Trace, traffic: np.ndarray) -> list[Path]:
         """Write all files and return their paths."""
@@ -117,13 +108,6 @@ class OutputDirectory(ResultFolder):
             if old.suffix in MESSAGE_WRITERS:
                 old.unlink()
         return self.move_in(made)
-
-
-def write_bus_log(path: Path, traffic: np.ndarray) -> None:
-    """Write frames, stamped with bus time, in the format of the file's suffix."""
-    with can.Logger(path) as writer:
-        for time_ns, can_id, dlc, data in traffic.tolist():
-            writer.on_message_received(to_message(time_ns, Frame(can_id, dlc, data), channel="can0"))
 
 
 def _mark_faults(axes: Any, faults: list[dict[str, Any]]) -> None:

@@ -1,9 +1,11 @@
 """Signals of a bus log by their names in the DBC."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from dbc.codec import MessageCodec
 from dbc.contract import Contract
 
 _MULTIPLEXOR_BITS = 8
@@ -70,6 +72,19 @@ class Series:
         if not known.size:
             raise NothingKnownError(f"none of {len(self)} values is known: let the bench run on first")
         return known
+
+
+def decoded(message: MessageCodec[..., Any], data: int) -> dict[str, str]:
+    """Return the signals of a payload by their DBC names: values with units, or the DBC's words for them."""
+    shown = {}
+    for name, signal in message.signals.items():
+        if signal.page is None or data & (1 << _MULTIPLEXOR_BITS) - 1 == signal.page:
+            raw = data >> signal.start & (1 << signal.length) - 1
+            if signal.signed and raw >> signal.length - 1:
+                raw -= 1 << signal.length
+            value = f"{raw * signal.factor + signal.offset:.10g} {signal.unit}".strip()
+            shown[name] = signal.choices.get(raw, value)
+    return shown
 
 
 def signal_of(traffic: np.ndarray, contract: Contract, name: str, start_ns: int = 0) -> Series:

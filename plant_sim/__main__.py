@@ -3,6 +3,7 @@
 import argparse
 import sys
 
+import hil.bus.mf4_on_demand  # noqa: F401  before python-can is imported
 from dbc.contract import Contract
 from hil.bus.wire import Clock
 from hil.run.node_process import add_node_arguments, node_main

@@ -2,7 +2,8 @@
 
 import os
 import signal
-from importlib.util import find_spec
+import subprocess
+import sys
 from pathlib import Path
 
 import can
@@ -301,11 +302,19 @@ def test_an_unknown_log_suffix(capsys, out, suffix):
     assert f"no bus log can be written as {suffix!r}: choose one of" in line
 
 
-@pytest.mark.skipif(find_spec("asammdf") is not None, reason="asammdf is there")
-def test_a_log_format_whose_package_is_missing_is_refused_before_the_run(capsys, out):
-    line = refused(capsys, "run", "sine", "--log", ".mf4", "--out", out)
-    assert "no bus log can be written as '.mf4'" in line
-    assert "asammdf" in line
+WITHOUT_ASAMMDF = "import sys; sys.modules['asammdf'] = None; from hil.cli import main; sys.exit(main())"
+
+
+@pytest.mark.parametrize("command", [("run", "sine", "--log", ".mf4"), ("replay", "bus.mf4")])
+def test_a_log_format_whose_package_is_missing_is_refused_before_the_run(out, command):
+    refused = subprocess.run(
+        [sys.executable, "-c", WITHOUT_ASAMMDF, *command, "--out", str(out)],
+        capture_output=True,
+        text=True,
+        timeout=SAFETY_NET_S,
+    )
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr == "hil: .mf4 needs asammdf: pip install 'ddh-hil[mf4]'\n"
     assert not out.exists()
 
 

@@ -378,7 +378,7 @@ def test_a_program_on_the_embedded_bus_hears_error_frames():
 
 
 def test_a_log_keeps_error_frames(tmp_path, bus):
-    from hil.report import write_bus_log
+    from hil.bus_log import write_bus_log
 
     destroy(bus, 1)
     bus.wire.run(10**6)
