@@ -1,19 +1,24 @@
 """The supervisor node: brings the machine up, then sends setpoints and mode commands as it is steered."""
 
 from collections.abc import Callable
+from functools import partial
 from heapq import heappop, heappush
 from itertools import count
 from typing import Any
 
 import numpy as np
 
+from dbc import e2e
 from dbc.contract import Contract
 from dbc.frame import Frame
+from dbc.jit import entry_point
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
+from dbc.packet import HEAD_DLC, NOT_ANSWERED, answer_by_entry_points
 from dbc.record import Record
 from hil.references import setpoint_counts
 from hil.scenario import CONTROLLERS, PERIOD_S, Scenario, law_of
+from hil.setpoints import answer_setpoint
 
 BRING_UP_PERIODS = 100
 """Periods from the supervisor's start to the first one of a scenario: the drive is enabled in them."""
@@ -33,6 +38,7 @@ _ENABLE_PERIODS = (20, 24, 28, 32)
 
 _COMMAND_PERIODS = 100
 _CHUNK = 1000
+_protect, _answer_setpoint = entry_point(e2e.profile2_protect), entry_point(answer_setpoint)
 
 
 class Supervisor:
@@ -77,17 +83,22 @@ class Supervisor:
         self._command = contract.controller_command
         self._bench_control = contract.bench_control
         self._bench_load = contract.bench_load
-        self._protect_setpoint = self._setpoint.protector().protect
+        counter, layout = np.zeros(1, np.int64), self._setpoint.protected_layout()
+        self._protect_setpoint = partial(_protect, counter, layout[: e2e.CONFIGURATION_SIZE])
+        setpoint_head = self._setpoint.can_id | self._setpoint.dlc << HEAD_DLC
+        self._answer_setpoint = partial(_answer_setpoint, setpoint_head, layout, counter)
         self._protect_command = self._command.protector().protect
         self.transmits = frozenset({self._setpoint.can_id, self._command.can_id})
         self._origin_ns = 0
-        self._initial = position_m, int(setpoint_counts(np.array(position_m)))
-        self._reference: Reference | None = None
+        self._initial_counts = int(setpoint_counts(np.array(position_m)))
+        self._reference: Reference = partial(np.full_like, fill_value=position_m)
         self._reference_begin = 0
-        self._chunk: tuple[list[float], list[int]] = ([], [])
+        self._chunk = np.zeros(0), np.zeros(0, np.int64)
         self._chunk_begin = 0
+        self._plain_until = 0  # the first period in which there is certainly more to do than a setpoint
         self._words = {"enable": 0, "law": law_of(controller), "fault_reset": 0, "load_n": 0}
         self._added_load_n = 0
+        self._load_n = 0
         self._plan: list[tuple[int, int, dict[str, Any]]] = []
         self._planned = count()
         for enable, periods in ((0, _ARMING_PERIODS), (1, _ENABLE_PERIODS)):
@@ -120,7 +131,7 @@ class Supervisor:
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: the machine is put to its initial state with the first period."""
         self._origin_ns = next_period(now_ns)
-        self.next_period = 0
+        self.next_period = self._plain_until = 0
         self.start_ns = self._origin_ns + BRING_UP_PERIODS * PERIOD_NS
         return Actions(self._origin_ns)
 
@@ -131,17 +142,39 @@ class Supervisor:
         reference_m, raw = self._position_in(period)
         sends: tuple[tuple[int, Frame], ...] = ()
         if self._setpoint.can_id not in self.silent:
-            payload = self._protect_setpoint(self._setpoint.pack(raw))
+            payload: int = self._protect_setpoint(self._setpoint.pack(raw))
             sends = ((now_ns, self._setpoint.frame(payload)),)
         if frames:
             sends += tuple((now_ns, frame) for frame in frames)
         self.record.append((now_ns, reference_m, raw, self._load_n))
         self.next_period = period + 1
+        next_command = (period // _COMMAND_PERIODS + 1) * _COMMAND_PERIODS
+        self._plain_until = min(next_command, self._chunk_begin + _CHUNK)
         return Actions(self._origin_ns + (period + 1) * PERIOD_NS, sends)
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
         """Hear nothing: the acceptance filter is empty."""
         return NOTHING
+
+    def answer(self, packet: memoryview, answer: bytearray) -> int:
+        """Do all that an event asks for in one call; see `dbc.packet`."""
+        period, length = self.next_period, NOT_ANSWERED
+        is_planned = self._plan and self._plan[0][0] <= period
+        if period < self._plain_until and not is_planned and not self.silent:
+            length = self._answer_setpoint(
+                *self._chunk,
+                period - self._chunk_begin,
+                self._origin_ns + period * PERIOD_NS,
+                self._load_n,
+                self.record.rows,
+                self.record.count,
+                packet,
+                answer,
+            )
+        if length == NOT_ANSWERED:
+            return answer_by_entry_points(self, packet, answer)
+        self.next_period = period + 1
+        return length
 
     def _frames_of_change(self, period: int) -> list[Frame]:
         """Return the frames beside the setpoint, in the order in which they are sent."""
@@ -149,7 +182,7 @@ class Supervisor:
         commanded = not is_first and period // _COMMAND_PERIODS > (self.next_period - 1) // _COMMAND_PERIODS
         if not (is_first or commanded or (self._plan and self._plan[0][0] <= period)):
             return []
-        frames = [self._control_frame(BenchCommand.RESET, 0, self._initial[1])] if is_first else []
+        frames = [self._control_frame(BenchCommand.RESET, 0, self._initial_counts)] if is_first else []
         loaded = is_first
         while self._plan and self._plan[0][0] <= period:
             _, _, words = heappop(self._plan)
@@ -157,11 +190,12 @@ class Supervisor:
                 frames.append(self._control_frame(*control))
             if reference := words.pop("reference", None):
                 self._reference, self._reference_begin = reference, period
-                self._chunk, self._chunk_begin = ([], []), period
+                self._chunk, self._chunk_begin = (np.zeros(0), np.zeros(0, np.int64)), period
             loaded |= bool(words.keys() & {"load_n", "add_load_n"})
             self._added_load_n += words.pop("add_load_n", 0)
             commanded |= bool(words.keys() & {"enable", "fault_reset"})
             self._words |= words
+        self._load_n = self._words["load_n"] + self._added_load_n
         if commanded and self._command.can_id not in self.silent:
             frames.append(self._command_frame())
         if loaded:
@@ -170,20 +204,14 @@ class Supervisor:
 
     def _position_in(self, period: int) -> tuple[float, int]:
         """Return the reference of a period, in m and in counts of the setpoint."""
-        if self._reference is None:
-            return self._initial
         index = period - self._chunk_begin
         if index >= len(self._chunk[0]):
             self._chunk_begin, index = period, 0
             elapsed = np.arange(period, period + _CHUNK) - self._reference_begin
             time_s = elapsed * PERIOD_S
             reference_m = np.broadcast_to(np.asarray(self._reference(time_s), float), time_s.shape)
-            self._chunk = reference_m.tolist(), setpoint_counts(reference_m).tolist()
-        return self._chunk[0][index], self._chunk[1][index]
-
-    @property
-    def _load_n(self) -> int:
-        return self._words["load_n"] + self._added_load_n
+            self._chunk = reference_m.copy(), setpoint_counts(reference_m).astype(np.int64)
+        return float(self._chunk[0][index]), int(self._chunk[1][index])
 
     def _command_frame(self) -> Frame:
         message, words = self._command, self._words

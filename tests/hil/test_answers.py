@@ -15,13 +15,15 @@ from dbc.contract import Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import PERIOD_NS, Node
-from dbc.packet import FRAME, START, TIMER, answer_by_entry_points, append_frame, pack_event
+from dbc.packet import FRAME, START, TIMER, answer_by_entry_points, append_frame, pack_event, unpack_actions
 from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.node import Controller
 from firmware_py.tuning import TUNINGS
 from hil.bus.link import MAX_PACKET
+from hil.references import lift_lower, sine
 from hil.run.inprocess import run_inprocess
 from hil.run.options import RunOptions
+from hil.supervisor import Supervisor
 from plant_sim.node import Plant
 from plant_sim.parameters import NOMINAL
 from plant_sim.sensors import PositionSensor
@@ -67,7 +69,8 @@ def heard_by(node: Node) -> st.SearchStrategy[Frame]:
     reset = st.integers(-(2**31), 2**31 - 1).map(
         lambda at: bench.frame(bench.pack(BenchCommand.RESET, 0, at))
     )
-    return st.one_of(noise, *intact, *intact, *intact, reset)
+    fault = st.builds(bench.pack, st.just(BenchCommand.SET_FAULT), st.integers(0, 8), st.sampled_from([0, 1]))
+    return st.one_of(noise, *intact, *intact, *intact, reset, fault.map(bench.frame))
 
 
 EVENTS = st.tuples(st.sampled_from([TIMER] * 6 + [FRAME, START]), st.integers(0, 3 * PERIOD_NS))
@@ -88,6 +91,53 @@ def test_any_events_are_answered_as_by_the_entry_points(new_node: Callable[[], A
         length = node.answer(packet, ours)
         assert length == answer_by_entry_points(twin, packet, theirs)
         assert ours[:length] == theirs[:length]
+    ours_by_name, theirs_by_name = node.record.columns_by_name(), twin.record.columns_by_name()
+    assert all(np.array_equal(ours_by_name[name], theirs_by_name[name]) for name in theirs_by_name)
+
+
+PERIODS_AHEAD = st.integers(-2, 150)
+STEERING = st.one_of(
+    st.fixed_dictionaries({"enable": st.integers(0, 1)}),
+    st.fixed_dictionaries({"load_n": st.integers(-3000, 3000)}),
+    st.fixed_dictionaries({"add_load_n": st.integers(-3000, 3000)}),
+    st.fixed_dictionaries({"reference": st.sampled_from([sine, lift_lower, lambda time_s: 0.1])}),
+)
+SILENT = st.sampled_from([set(), {CONTRACT.position_setpoint.can_id}, {CONTRACT.controller_command.can_id}])
+
+
+@settings(max_examples=30)
+@given(
+    acts=st.lists(
+        st.tuples(
+            st.lists(st.tuples(PERIODS_AHEAD, STEERING), max_size=2),
+            SILENT,
+            st.integers(0, 120),
+            st.sampled_from([0, 0, 0, 1, PERIOD_NS // 2, 3 * PERIOD_NS]),
+        ),
+        max_size=12,
+    )
+)
+def test_the_supervisor_too_however_it_is_steered_and_however_late_it_is_asked(acts):
+    node, twin = Supervisor(CONTRACT, "adrc", 0.1), Supervisor(CONTRACT, "adrc", 0.1)
+    ours, theirs = bytearray(MAX_PACKET), bytearray(MAX_PACKET)
+
+    def ask(kind: int, now_ns: int) -> int:
+        packet = memoryview(pack_event(kind, now_ns))
+        length = node.answer(packet, ours)
+        assert length == answer_by_entry_points(twin, packet, theirs)
+        assert ours[:length] == theirs[:length]
+        return unpack_actions(ours, length).wake_ns
+
+    wake_ns = ask(START, 0)
+    for plans, silent, periods, late_ns in acts:
+        for ahead, words in plans:
+            for each in (node, twin):
+                each.plan(each.next_period + ahead, **words)
+        node.silent, twin.silent = set(silent), set(silent)
+        for _ in range(periods):
+            wake_ns = ask(TIMER, wake_ns)
+        wake_ns = ask(TIMER, wake_ns + late_ns)
+    assert node.next_period == twin.next_period
     ours_by_name, theirs_by_name = node.record.columns_by_name(), twin.record.columns_by_name()
     assert all(np.array_equal(ours_by_name[name], theirs_by_name[name]) for name in theirs_by_name)
 
