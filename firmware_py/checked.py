@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from firmware_py import kernel
+from firmware_py.kernel import machine
 
 KERNEL = kernel.__name__
 
@@ -134,6 +135,37 @@ def i64(value: int) -> Int64:
     raise OverflowError(f"i64: {int(value)}")
 
 
+def low32(value: int) -> Int32:
+    """Return the low 32 bits, in two's complement."""
+    return Int32(machine.low32(int(value)))
+
+
+def clz(value: int) -> Int32:
+    """Leading zeros of a 64-bit value.
+
+    Raises
+    ------
+    OverflowError
+        When the value is not positive.
+    """
+    if not 0 < value <= HIGH64:
+        raise OverflowError(f"clz: {int(value)}")
+    return Int32(machine.clz(int(value)))
+
+
+def div32(dividend: int, divisor: int) -> Int32:
+    """Quotient of 32-bit integers that are not negative.
+
+    Raises
+    ------
+    ZeroDivisionError, OverflowError
+        When the divisor is zero, or an operand negative.
+    """
+    if dividend < 0 or divisor < 0:
+        raise OverflowError(f"div32: {int(dividend)} / {int(divisor)}")
+    return i32(machine.div32(int(dividend), int(divisor)))
+
+
 def div(dividend: int, divisor: int) -> Int64:
     """Quotient truncated towards zero, as in C.
 
@@ -189,7 +221,7 @@ def load() -> dict[str, ModuleType]:
             module.__dict__["__builtins__"] |= {"int": int, "memoryview": memoryview}
         exec(compile(Path(spec.origin).read_text(), spec.origin, "exec"), module.__dict__)
         if name == f"{KERNEL}.machine":
-            module.__dict__.update(i32=i32, i64=i64, div=div)
+            module.__dict__.update(i32=i32, i64=i64, low32=low32, clz=clz, div32=div32, div=div)
         return module
 
     def import_kernel(

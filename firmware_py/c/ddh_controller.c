@@ -4,14 +4,37 @@
  */
 #include "ddh_controller.h"
 
-/* What the code takes for granted, and C99 leaves to the compiler: >> of a negative number keeps its sign. */
+/* What the code takes for granted, and C99 leaves to the compiler: >> of a negative number keeps its sign,
+ * narrowing keeps the low bits.
+ */
+typedef char ddh_assert_narrowing[(int32_t)UINT32_MAX == (int32_t)-1 ? 1 : -1];
 typedef char ddh_assert_shift_32[((int32_t)-3 >> 1) == (int32_t)-2 ? 1 : -1];
 typedef char ddh_assert_shift_64[((int64_t)-3 >> 1) == (int64_t)-2 ? 1 : -1];
+
+/* value * 2^count; C leaves << of a negative number undefined. */
+static int32_t shl32(int32_t value, int32_t count)
+{
+    return value * ((int32_t)1 << count);
+}
 
 /* value * 2^count; C leaves << of a negative number undefined. */
 static int64_t shl64(int64_t value, int32_t count)
 {
     return value * ((int64_t)1 << count);
+}
+
+/* Leading zeros of value > 0. */
+static int32_t clz(int64_t value)
+{
+#ifdef __GNUC__
+    return (int32_t)__builtin_clzll((uint64_t)value);
+#else
+    int32_t count = 0;
+    while ((value >> (62 - count)) == 0) {
+        count++;
+    }
+    return count + 1;
+#endif
 }
 
 /* fixedpoint: Fixed-point arithmetic: one rounding rule (half up), saturation, and an exact integer square root. */
@@ -24,13 +47,14 @@ enum {
 /* Narrow to 32 bits, saturating. */
 static int32_t sat32(int64_t value)
 {
-    if (value > DDH_INT32_MAX) {
-        return DDH_INT32_MAX;
+    int32_t low = (int32_t)(uint32_t)value;
+    if (low == value) {
+        return low;
     }
-    if (value < DDH_INT32_MIN) {
+    if (value < 0) {
         return DDH_INT32_MIN;
     }
-    return (int32_t)value;
+    return DDH_INT32_MAX;
 }
 
 /* Magnitude; value must not be the most negative 64-bit number. */
@@ -66,55 +90,68 @@ static int64_t mul_q(int32_t value, int32_t mantissa, int32_t shift)
     return round_shift((int64_t)value * (int64_t)mantissa, shift);
 }
 
-/* value times the gain whose mantissa and shift stand at index and index + 1. */
+/* value times the gain whose mantissa and shift stand at index and index + 1, rounded half up.
+ *
+ * Half an LSB is added behind the shift: before it, a shift that is no constant would take a second one.
+ */
 static int64_t gain(const int32_t *calibration, int32_t index, int32_t value)
 {
-    return mul_q(value, calibration[index], calibration[index + 1]);
+    int64_t product = (int64_t)value * (int64_t)calibration[index];
+    return ((product >> (calibration[index + 1] - 1)) + 1) >> 1;
 }
 
-/* Floor of the square root of value >= 0, digit by digit from its leading one. */
+/* Floor of the square root of 0 < value < 2^61, in two halves (Zimmermann, "Karatsuba Square Root").
+ *
+ * wide is value times 4^n within [2^59, 2^61). The root of its head, in [2^29, 2^31), is a quadratic
+ * polynomial with a relative error of at most 0.0051 and one step of Newton's, which gives the floor or one
+ * more. A division by twice that root gives the other 15 bits, or one too many in the last place.
+ */
+static int64_t isqrt_61(int64_t value)
+{
+    int32_t shift = shl32((clz(value) - 3) >> 1, 1);
+    int64_t wide = shl64(value, shift);
+    int32_t head = (int32_t)(wide >> 30);
+    int64_t x = (int64_t)(head >> 15);
+    int32_t slope = 24376 - ((int32_t)((int64_t)3665 * x) >> 15);
+    int32_t root = 12015 + ((int32_t)(x * (int64_t)slope) >> 15);
+    root = (root + (int32_t)((uint32_t)head / (uint32_t)root)) >> 1;
+    int32_t rest = (int32_t)((int64_t)head - ((int64_t)root * (int64_t)root));
+    if (rest < 0) {
+        rest = rest + shl32(root, 1) - 1;
+        root = root - 1;
+    }
+    int32_t below = (int32_t)((wide >> 16) - shl64(wide >> 30, 14));
+    root = shl32(root, 15) + (int32_t)((uint32_t)(shl32(rest, 14) + below) / (uint32_t)root);
+    if (((int64_t)root * (int64_t)root) > wide) {
+        root = root - 1;
+    }
+    return (int64_t)(root >> (shift >> 1));
+}
+
+/* Floor of the square root of value >= 0. */
 static int64_t isqrt(int64_t value)
 {
-    int64_t bit = (int64_t)1;
-    int64_t head = value;
-    if ((head >> 32) > 0) {
-        head = head >> 32;
-        bit = shl64(bit, 32);
+    if (value <= 0) {
+        return (int64_t)0;
     }
-    if ((head >> 16) > 0) {
-        head = head >> 16;
-        bit = shl64(bit, 16);
-    }
-    if ((head >> 8) > 0) {
-        head = head >> 8;
-        bit = shl64(bit, 8);
-    }
-    if ((head >> 4) > 0) {
-        head = head >> 4;
-        bit = shl64(bit, 4);
-    }
-    if ((head >> 2) > 0) {
-        bit = shl64(bit, 2);
-    }
-    int64_t rest = value;
-    int64_t root = (int64_t)0;
-    while (bit > 0) {
-        int64_t trial = root + bit;
-        root = root >> 1;
-        if (rest >= trial) {
-            rest = rest - trial;
-            root = root + bit;
+    if ((value >> 61) > 0) {
+        int64_t root = shl64(isqrt_61(value >> 2), 1);
+        if ((value - (root * root)) > shl64(root, 1)) {
+            root = root + 1;
         }
-        bit = bit >> 2;
+        return root;
     }
-    return root;
+    return isqrt_61(value);
 }
 
 /* Store a state, saturating; count it when it saturates. */
 static void store(int32_t *state, int32_t index, int64_t value)
 {
-    state[index] = sat32(value);
-    if (state[index] != value) {
+    int32_t low = (int32_t)(uint32_t)value;
+    if (low == value) {
+        state[index] = low;
+    } else {
+        state[index] = sat32(value);
         state[DDH_ST_SATURATIONS] = sat32((int64_t)state[DDH_ST_SATURATIONS] + 1);
     }
 }

@@ -246,6 +246,13 @@ class FunctionWriter:
                 return f"(int32_t){self._operand(node.args[0])}"
             case "i64":
                 return f"(int64_t){self._operand(node.args[0])}"
+            case "low32":
+                return f"(int32_t)(uint32_t){self._operand(node.args[0])}"
+            case "clz":
+                return f"clz({self._plain(node.args[0])})"
+            case "div32":
+                dividend, divisor = map(self._operand, node.args)
+                return f"(int32_t)((uint32_t){dividend} / (uint32_t){divisor})"
             case "div":
                 return f"{self._operand(node.args[0])} / {self._operand(node.args[1])}"
         return f"{self._names.functions[name]}({', '.join(map(self._plain, node.args))})"

@@ -1,7 +1,7 @@
 """Machine words: the only names whose meaning depends on what runs the kernel.
 
-Plain Python leaves widths unchecked; `firmware_py.checked` and `firmware_py.compiled` replace `i32` and
-`i64` with their own. Annotations give the C types.
+Plain Python leaves widths unchecked; `firmware_py.checked` and `firmware_py.compiled` replace them with
+their own. Annotations give the C types.
 """
 
 int32 = int
@@ -17,6 +17,21 @@ def i32(value: int64) -> int32:
 def i64(value: int32) -> int64:
     """Widen to 64 bits."""
     return value
+
+
+def low32(value: int64) -> int32:
+    """Return the low 32 bits, in two's complement."""
+    return (value + 2**31) % 2**32 - 2**31
+
+
+def clz(value: int64) -> int32:
+    """Leading zeros of the 64-bit `value` > 0: CLZ where there is one."""
+    return 64 - value.bit_length()
+
+
+def div32(dividend: int32, divisor: int32) -> int32:
+    """Quotient of `dividend` >= 0 and `divisor` > 0: one UDIV where there is one."""
+    return dividend // divisor
 
 
 def div(dividend: int64, divisor: int64) -> int64:

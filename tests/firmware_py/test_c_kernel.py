@@ -135,6 +135,7 @@ VECTORS = {
     "round_shift": [HALF, SHIFTS],
     "mul_q": [NARROW, NARROW, SHIFTS],
     "isqrt": [AROUND_SQUARES],
+    "isqrt_61": [[value for value in AROUND_SQUARES if 0 < value < 2**61]],
     "fal_1_2": [[*NARROW, *DELTAS, *(-delta for delta in DELTAS)], DELTAS],
     "fal_3_4": [[*NARROW, *DELTAS, *(-delta for delta in DELTAS)], DELTAS],
     "approach": [GAPS, BRAKES],

@@ -4,6 +4,7 @@ import math
 from fractions import Fraction
 
 import numba
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -24,6 +25,21 @@ def compiled_isqrt(value):
 
 
 @numba.njit
+def compiled_low32(value):
+    return machine.low32(value)
+
+
+@numba.njit
+def compiled_clz(value):
+    return machine.clz(value)
+
+
+@numba.njit
+def compiled_div32(dividend, divisor):
+    return machine.div32(dividend, divisor)
+
+
+@numba.njit
 def compiled_div(dividend, divisor):
     return machine.div(dividend, divisor)
 
@@ -31,6 +47,15 @@ def compiled_div(dividend, divisor):
 @numba.njit
 def compiled_mul_q(value, mantissa, shift):
     return fixedpoint.mul_q(value, mantissa, shift)
+
+
+@numba.njit
+def compiled_gain(value, mantissa, shift):
+    return fixedpoint.gain(np.array([mantissa, shift], np.int32), 0, value)
+
+
+def checked_gain(value, mantissa, shift):
+    return int(FIXED.gain(checked.CheckedArray([mantissa, shift]), 0, checked.i32(value)))
 
 
 @numba.njit
@@ -71,7 +96,21 @@ ISQRT = pytest.mark.parametrize("isqrt", [wide(FIXED.isqrt), compiled_isqrt], id
 DIV = pytest.mark.parametrize(
     "div", [wide(MODULES["machine"].div), compiled_div], ids=["checked", "compiled"]
 )
+LOW32 = pytest.mark.parametrize(
+    "low32",
+    [machine.low32, wide(MODULES["machine"].low32), compiled_low32],
+    ids=["plain", "checked", "compiled"],
+)
+CLZ = pytest.mark.parametrize(
+    "clz", [machine.clz, wide(MODULES["machine"].clz), compiled_clz], ids=["plain", "checked", "compiled"]
+)
+DIV32 = pytest.mark.parametrize(
+    "div32",
+    [machine.div32, narrow(MODULES["machine"].div32), compiled_div32],
+    ids=["plain", "checked", "compiled"],
+)
 MUL_Q = pytest.mark.parametrize("mul_q", [narrow(FIXED.mul_q), compiled_mul_q], ids=["checked", "compiled"])
+GAIN = pytest.mark.parametrize("gain", [checked_gain, compiled_gain], ids=["checked", "compiled"])
 SAT32 = pytest.mark.parametrize("sat32", [wide(FIXED.sat32), compiled_sat32], ids=["checked", "compiled"])
 FAL_1_2 = pytest.mark.parametrize(
     "fal_1_2", [narrow(MODULES["fal"].fal_1_2), compiled_fal_1_2], ids=["checked", "compiled"]
@@ -97,6 +136,50 @@ def test_isqrt_around_squares_and_powers_of_four(isqrt):
             assert isqrt(neighbour) == math.isqrt(neighbour), neighbour
 
 
+@numba.njit
+def first_wrong_root(values):
+    """The first of `values` whose root is not its floor, or -1."""
+    for value in values:
+        root = fixedpoint.isqrt(value)
+        if not (root * root <= value and value - root * root <= 2 * root):
+            return value
+    return -1
+
+
+def test_isqrt_of_a_million_random_numbers_of_every_size():
+    rng = np.random.default_rng(4)
+    values = rng.integers(0, 2**63 - 1, 1_000_000) >> rng.integers(0, 63, 1_000_000)
+    assert first_wrong_root(values) == -1
+
+
+def test_isqrt_wherever_its_first_half_can_change():
+    """The polynomial changes with the head's upper bits, the root with squares; between, all is monotonic."""
+    squares = np.arange(23170, 46342) ** 2
+    heads = np.unique(np.concatenate([squares, np.arange(2**14, 2**16 + 1) << 15]))
+    heads = np.concatenate([heads - 1, heads])
+    heads = heads[(heads >= 2**29) & (heads < 2**31)]
+    assert len(heads) > 140_000
+    for low in (0, 1, 2**29, 2**30 - 2, 2**30 - 1):
+        assert first_wrong_root((heads << 30) + low) == -1
+
+
+@numba.njit
+def first_wrong_head(low):
+    """The first head of all, with the 30 bits `low` below it, whose root is not its floor, or -1."""
+    for head in range(2**29, 2**31):
+        value = (head << 30) + low
+        root = fixedpoint.isqrt(value)
+        if not (root * root <= value and value - root * root <= 2 * root):
+            return value
+    return -1
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("low", [0, 2**30 - 1])
+def test_isqrt_of_every_head(low):
+    assert first_wrong_head(low) == -1
+
+
 @DIV
 @given(dividend=INT64, divisor=st.integers(1, 2**63 - 1))
 @example(dividend=-7, divisor=2)
@@ -107,12 +190,57 @@ def test_div_truncates_towards_zero_as_c_does(div, dividend, divisor):
     assert div(dividend, divisor) == math.trunc(Fraction(dividend, divisor))
 
 
+@LOW32
+@given(value=INT64)
+@example(value=2**31)
+@example(value=-(2**31) - 1)
+@example(value=2**32 - 1)
+def test_low32_keeps_the_low_bits(low32, value):
+    assert low32(value) == int.from_bytes((value % 2**32).to_bytes(4, "little"), "little", signed=True)
+
+
+@CLZ
+@given(value=st.integers(1, 2**63 - 1))
+@example(value=1)
+@example(value=2**32)
+def test_clz_counts_the_zeros_before_the_leading_one(clz, value):
+    assert clz(value) == len(f"{value:064b}".split("1")[0])
+
+
+@DIV32
+@given(dividend=st.integers(0, 2**31 - 1), divisor=POSITIVE32)
+@example(dividend=2**31 - 1, divisor=1)
+def test_div32_is_the_quotient(div32, dividend, divisor):
+    assert div32(dividend, divisor) == math.trunc(Fraction(dividend, divisor))
+
+
+@pytest.mark.parametrize(
+    ("word", "arguments"), [("clz", [0]), ("clz", [-1]), ("div32", [-1, 2]), ("div32", [1, -2])]
+)
+def test_machine_words_refuse_what_c_leaves_undefined(word, arguments):
+    with pytest.raises(OverflowError, match=word):
+        getattr(checked, word)(*arguments)
+
+
+def test_div32_refuses_a_zero_divisor():
+    with pytest.raises(ZeroDivisionError):
+        checked.div32(1, 0)
+
+
 @MUL_Q
 @given(value=INT32, mantissa=INT32, shift=SHIFT)
 @example(value=-1, mantissa=1, shift=1)
 @example(value=-(2**31), mantissa=-(2**31), shift=62)
 def test_mul_q_rounds_half_up(mul_q, value, mantissa, shift):
     assert mul_q(value, mantissa, shift) == math.floor(Fraction(value * mantissa, 2**shift) + Fraction(1, 2))
+
+
+@GAIN
+@given(value=INT32, mantissa=INT32, shift=st.integers(8, 62))
+@example(value=-1, mantissa=1, shift=8)
+@example(value=-(2**31), mantissa=-(2**31), shift=62)
+def test_gain_rounds_half_up(gain, value, mantissa, shift):
+    assert gain(value, mantissa, shift) == math.floor(Fraction(value * mantissa, 2**shift) + Fraction(1, 2))
 
 
 @SAT32
