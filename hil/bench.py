@@ -303,14 +303,13 @@ class Bench:
     def result(self, name: str) -> dict[str, Any]:
         """Return the figures so far, under the name of a test."""
         figures = figures_of(
-            self.recording, self.trace, self.timing, self._contract, self.bit_rate, self.mode
+            self.recording, self.trace, self.timing, self._contract, self.bit_rate, self.mode, self._faults
         )
         return {
             "scenario": name,
             "controller": self.controller,
             **self._setting,
             **figures,
-            "faults": [fault.table for fault in self._faults],
             "paper": None,
         }
 

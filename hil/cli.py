@@ -22,6 +22,7 @@ from dbc.contract import ContractError
 from firmware_py.calibration import CalibrationError
 from firmware_py.chosen_tuning import DEFAULT_TUNING, add_tuning_arguments, tuning_of
 from firmware_py.tuning import TUNINGS
+from hil import inject_command
 from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
@@ -44,7 +45,7 @@ from hil.run.options import (
 from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
-from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, controller_of, load_scenario
+from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, controller_of, load_scenario, too_late
 from hil.study import replay_command, reproduce, rta_command, sweep_command, tune_command
 from hil.study.box import BoxError
 from hil.supervisor import BRING_UP_S
@@ -145,6 +146,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     bus.add_argument("--parent", type=int, help=argparse.SUPPRESS)
 
+    inject_command.add_command(commands)
+
     vcan = commands.add_parser("vcan", help="SocketCAN on this machine")
     questions = vcan.add_subparsers(required=True, metavar="QUESTION")
     status = questions.add_parser("status", help="say whether SocketCAN is usable; exit code 0 if it is")
@@ -178,6 +181,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.machine is not None:
         scenario = replace(scenario, machine=scenario.machine.with_text(arguments.machine))
     faults = *scenario.faults, *map(fault_of_text, arguments.fault)
+    for fault in faults:
+        if complaint := too_late(fault, scenario.duration_s):
+            raise FaultError(complaint)
     scenario = replace(scenario, faults=tuple(sorted(faults, key=attrgetter("at_s"))))
     if arguments.mode == "realtime" and (virtual := [f for f in scenario.faults if f.needs_virtual_time]):
         raise BenchError(f"the fault {virtual[0].text} needs virtual time: use --mode inprocess or lockstep")
@@ -296,6 +302,7 @@ def _bus(arguments: argparse.Namespace) -> int:
         return not (orphaned(arguments.parent) or stopped.is_set())
 
     with Hub(Wire(arguments.bitrate), arguments.channel, expected=None) as hub:
+        inject_command.take_faults(hub)
         print(
             f"{HUB_GREETING} {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True
         )

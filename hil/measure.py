@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -13,6 +14,7 @@ from firmware_py.node import PHASE_NS
 from firmware_py.state_machine import State
 from firmware_py.task import Fault
 from hil.bus.wire_time import traffic_bits
+from hil.faults.fault import Fault as InjectedFault
 from hil.run.options import Recording, RigOptions, RunOptions
 from hil.scenario import PERIOD_S, TimingLimits
 from hil.signals import Series, signal_of
@@ -104,13 +106,20 @@ def _by_period(rows: int, period: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def figures_of(
-    recording: Recording, trace: Trace, timing: Timing, contract: Contract, bit_rate: int, mode: str
+    recording: Recording,
+    trace: Trace,
+    timing: Timing,
+    contract: Contract,
+    bit_rate: int,
+    mode: str,
+    faults: Sequence[InjectedFault],
 ) -> dict[str, Any]:
-    """Return what was measured in a run.
+    """Return what was measured in a run, and what went wrong in it.
 
     RMS and maximum are over e(t_k) = r(t_k) - x(t_k), x being the plant's unquantised position, or, where
     the plant left no record, the measured one on the bus.
     """
+    injected: Any = recording.notes.get("injected_faults", [])
     error_mm = Series(trace["time_s"], trace["error_m"] * M_TO_MM)
     chatter_rpm = Series(trace["time_s"][1:], np.diff(trace["target_velocity_rpm"]))
     return {
@@ -131,6 +140,8 @@ def figures_of(
         "wall_s": recording.wall_s,
         "startup_s": recording.startup_s,
         "realtime_factor": recording.simulated_s / recording.wall_s if recording.wall_s else 0.0,
+        "faults": [fault.table for fault in faults] + injected,
+        "reproducible": mode != "realtime" and not injected and not recording.notes.get("injections"),
         "notes": recording.notes,
     }
 
@@ -149,7 +160,7 @@ def result_of(
     """Return a scenario's figures and the verdict on them, as written to ``result.json``."""
     scenario, bit_rate = options.scenario, options.wire_bit_rate
     timing = timing_in(recording, trace, contract, bit_rate, mode)
-    figures = figures_of(recording, trace, timing, contract, bit_rate, mode)
+    figures = figures_of(recording, trace, timing, contract, bit_rate, mode, scenario.faults)
     limits = scenario.limits.get(options.controller)
     within, verdict = None, ""
     if not recording.ending:
@@ -160,7 +171,6 @@ def result_of(
         "controller": options.controller,
         **setting_of(options),
         **figures,
-        "faults": [fault.table for fault in scenario.faults],
         "limits": limits,
         "timing_limits": scenario.timing.given() or None,
         "within_limits": within,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dbc.node import PERIOD_NS
-from hil.faults.catalogue import KINDS, fault_of
+from hil.faults.catalogue import fault_of_table
 from hil.faults.fault import LONGEST_S, Fault, FaultError
 from hil.faults.machine import MAX_LOAD_N
 from hil.references import REFERENCES
@@ -144,7 +144,8 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
     name : str
         Name or path.
     duration_s : float, optional
-        Length to play instead of the scenario's own, s; its limits and the paper's figures do not apply then.
+        Length to play instead of the scenario's own, s; its limits, the paper's figures and faults that come
+        later do not apply then.
 
     Raises
     ------
@@ -170,11 +171,13 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
     if duration_s is not None:
         changes = {"limits": {}, "paper": {}, "timing": TimingLimits(), "duration_s": _duration_s(duration_s)}
     try:
-        return replace(_checked(path.stem, content), **changes)
+        scenario = replace(_checked(path.stem, content), **changes)
     except _WrongKeyError as error:
         line = line_of(text, error.path)
         where = name if line is None else f"{name}: line {line}"
         raise ScenarioError(f"{where}: {error}") from error
+    faults = tuple(fault for fault in scenario.faults if fault.at_s < scenario.duration_s)
+    return replace(scenario, faults=faults)
 
 
 class _WrongKeyError(ScenarioError):
@@ -203,7 +206,7 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
         paper=_figures(content, "paper"),
         timing=_timing_limits(content.get("timing", {})),
         machine=_machine(content.get("machine", {})),
-        faults=_faults(content.get("fault", [])),
+        faults=_faults(content.get("fault", []), content["duration_s"]),
     )
 
 
@@ -284,19 +287,27 @@ def _machine(value: Any) -> Machine:
     return machine
 
 
-def _faults(value: Any) -> tuple[Fault, ...]:
+def _faults(value: Any, duration_s: float) -> tuple[Fault, ...]:
     if not isinstance(value, list):
         raise _WrongKeyError(("fault",), "fault is no list: write each as a table [[fault]]")
-    return tuple(
-        _fault(_table(table, ("fault", i), "[[fault]]"), ("fault", i)) for i, table in enumerate(value)
-    )
+    faults = tuple(_fault(table, ("fault", number)) for number, table in enumerate(value))
+    for number, fault in enumerate(faults):
+        if complaint := too_late(fault, duration_s):
+            raise _WrongKeyError(("fault", number, "at_s"), complaint)
+    return faults
 
 
-def _fault(table: dict[str, Any], path: Path) -> Fault:
-    if "kind" not in table:
-        raise _WrongKeyError(path, f"missing key 'kind' in {_dotted(path)}; it is one of {', '.join(KINDS)}")
+def too_late(fault: Fault, duration_s: float) -> str:
+    """Return what to say of a fault that would come after the end; nothing if it comes before."""
+    if fault.at_s < duration_s:
+        return ""
+    return f"{fault.kind}: at_s is {fault.at_s}, must be below duration_s, {duration_s:g} s"
+
+
+def _fault(value: Any, path: Path) -> Fault:
+    table = _table(value, path, "[[fault]]")
     try:
-        return fault_of(table["kind"], {key: value for key, value in table.items() if key != "kind"})
+        return fault_of_table(table)
     except FaultError as error:
         raise _WrongKeyError((*path, error.key) if error.key in table else path, str(error)) from error
 

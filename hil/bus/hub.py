@@ -16,6 +16,7 @@ import numpy as np
 from dbc.frame import Frame
 from dbc.packet import pack_event
 from hil.bus import link
+from hil.bus.agenda import Agenda
 from hil.bus.link import LinkError
 from hil.bus.wire import NEVER, Clock, Port, Wire
 from hil.bus.wire_core import LOG_SENDER, MAX_PORTS
@@ -164,6 +165,13 @@ class Hub:
     ------
     LinkError
         If another hub serves the channel.
+
+    Attributes
+    ----------
+    take_fault : callable
+        Has a fault, as a table, that somebody asks for; raises ValueError with the reason if it cannot.
+    agenda : Agenda
+        What is to be done to the wire, in wall time.
     """
 
     def __init__(
@@ -173,6 +181,8 @@ class Hub:
         self.channel = channel
         self.nodes: dict[str, RemoteNode] = {}
         self.injections: list[tuple[int, Frame]] = []
+        self.take_fault: Callable[[dict[str, Any]], None] = _take_no_fault
+        self.agenda = Agenda(wire)
         self._dropped_by_gone = 0
         self._expected = expected
         self._virtual = expected is not None
@@ -181,6 +191,7 @@ class Hub:
         self._strangers: dict[int, socket.socket] = {}
         self._held: set[int] = set()
         self._senders = itertools.count(MAX_PORTS)
+        self._own_sender = next(self._senders)
         self._catch_up: Callable[[], None] = lambda: None
         self._selector = selectors.SelectSelector()
         self._path = link.socket_path(channel)
@@ -249,14 +260,18 @@ class Hub:
     ) -> None:
         """Serve while `keep_running` says so, with bus time running as `clock_ns` does."""
         origin_ns = clock_ns()
-        self._catch_up = lambda: self.wire.run(clock_ns() - origin_ns)
+        self._catch_up = lambda: self.agenda.run(clock_ns() - origin_ns)
         while keep_running():
             self._catch_up()
             self._pass_on()  # now: nothing else may happen for long
-            next_ns = self.wire.next_event_ns()
+            next_ns = min(self.wire.next_event_ns(), self.agenda.next_ns)
             wait_s = _IDLE_POLL_S if next_ns >= NEVER else (next_ns - self.wire.now_ns) / 1e9
             self.service(min(max(wait_s, 0.0), _IDLE_POLL_S))
             self._discard_what_all_have_read()
+
+    def send(self, frame: Frame) -> None:
+        """Send a frame of the hub's own."""
+        self.wire.send(self._own_sender, self.wire.now_ns, frame)
 
     def attach(self, name: str, clock: Clock | None = None) -> Port:
         """Put a node that has said hello onto the wire."""
@@ -327,13 +342,12 @@ class Hub:
         self._selector.unregister(connection)
         try:
             hello = link.receive_json(connection)
-            error = self._refusal(hello)
-            if error:
-                link.send_json(connection, {"error": error})
-                connection.close()
-                return
-            link.send_json(connection, {"virtual": self._virtual, "bit_rate": self.wire.bit_rate})
+            answer = self._answer_to(hello)
+            link.send_json(connection, answer)
         except (LinkError, OSError):
+            connection.close()
+            return
+        if "error" in answer or hello["role"] == "fault":
             connection.close()
             return
         if self._virtual and hello["role"] == "node":
@@ -344,6 +358,20 @@ class Hub:
         participant = Participant(connection, name, sender, len(self.wire.log))
         self._participants[connection.fileno()] = participant, connection
         self._selector.register(connection, selectors.EVENT_READ)
+
+    def _answer_to(self, hello: dict[str, Any]) -> dict[str, Any]:
+        if error := self._refusal(hello):
+            return {"error": error}
+        if hello["role"] == "fault":
+            try:
+                self.take_fault(hello["fault"])
+            except ValueError as error:
+                return {"error": str(error)}
+        return {
+            "virtual": self._virtual,
+            "bit_rate": self.wire.bit_rate,
+            "bus_time_s": self.wire.now_ns / 1e9,
+        }
 
     def _refusal(self, hello: dict[str, Any]) -> str | None:
         if hello.get("version") != link.PROTOCOL_VERSION:
@@ -386,10 +414,16 @@ class Hub:
         connection.close()
 
 
+def _take_no_fault(table: dict[str, Any]) -> None:
+    raise ValueError("nothing runs on this channel yet: inject faults when it does")
+
+
 def _is_complete(hello: dict[str, Any]) -> bool:
     """Tell whether a greeting has all that its role needs."""
     if hello.get("role") == "bus":
         return True
+    if hello.get("role") == "fault":
+        return isinstance(hello.get("fault"), dict)
     accepts = hello.get("accepts", ())
     ids = [hello.get("latched"), hello.get("transmits"), [] if accepts is None else accepts]
     return (

@@ -5,7 +5,7 @@ from dataclasses import MISSING, fields
 from typing import Any, NamedTuple
 
 from hil.faults import bus, controller, machine, message
-from hil.faults.fault import Fault, FaultError, allowed
+from hil.faults.fault import Fault, FaultError, allowed, described
 
 GROUPS: dict[str, tuple[type[Fault], ...]] = {
     "bus": (
@@ -66,7 +66,7 @@ class Row(NamedTuple):
     summary : str
         What happens.
     parameters : tuple of str
-        What each may be, in words, with its default.
+        Name, values, and in brackets the default of each.
     real_time : bool
         Whether it can be had in real time as well.
     """
@@ -113,6 +113,19 @@ def fault_of(kind: str, parameters: Mapping[str, Any]) -> Fault:
     return KINDS[kind](**parameters)
 
 
+def fault_of_table(table: Mapping[str, Any]) -> Fault:
+    """Return the fault that a table as in a scenario file describes, with its kind under ``kind``.
+
+    Raises
+    ------
+    FaultError
+        If the kind is missing, or as for `fault_of`.
+    """
+    if "kind" not in table:
+        raise FaultError(f"missing key 'kind': it is one of {', '.join(KINDS)}")
+    return fault_of(table["kind"], {key: value for key, value in table.items() if key != "kind"})
+
+
 def fault_of_text(text: str) -> Fault:
     """Return the fault that a text like ``sensor_bias,at_s=1,bias_m=0.001`` describes.
 
@@ -136,11 +149,7 @@ def _summary(kind: type[Fault]) -> str:
 
 
 def _parameters(kind: type[Fault]) -> tuple[str, ...]:
-    return tuple(
-        f"{item.name}: {allowed(item)}" + ("" if item.default is MISSING else f" (default {item.default})")
-        for item in fields(kind)
-        if item.name != "at_s"
-    )
+    return tuple(described(item) for item in fields(kind) if item.name != "at_s")
 
 
 def _value(text: str) -> int | float | str:

@@ -6,13 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import partial
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from dbc.contract import Contract
 from hil.bus.wire import Port, Wire
-
-if TYPE_CHECKING:
-    from hil.supervisor import Supervisor
 
 LONGEST_S = 3600.0
 _NS_PER_S = 1_000_000_000
@@ -37,14 +34,22 @@ def number(low: float, high: float, unit: str, default: Any = MISSING) -> Any:
     return field(default=default, metadata={"bounds": (low, high), "unit": unit})
 
 
-def choice(*names: str, default: Any = MISSING) -> Any:
-    """Return a field for one of some names."""
-    return field(default=default, metadata={"choices": names})
+def choice(*names: str, called: str = "", default: Any = MISSING) -> Any:
+    """Return a field for one of some names; many may be `called` something in a list of faults."""
+    return field(default=default, metadata={"choices": names, "called": called or ", ".join(names)})
 
 
 def name(of_what: str) -> Any:
     """Return a field for a name that other parameters decide on."""
     return field(metadata={"name": of_what})
+
+
+class Planner(Protocol):
+    """What a supervisor is to faults."""
+
+    @property
+    def plan(self) -> Callable[..., None]:
+        """Takes a period since power-on, and what is to change in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +60,8 @@ class Stage:
     ----------
     contract : Contract
         The DBC.
-    supervisor : Supervisor or None
-        Sends what goes over the bench channel; None on a bus that has none of ours.
+    supervisor : Planner
+        Sends what goes over the bench channel.
     wire : Wire or None
         The simulated bus; None on a real one.
     ports : mapping of str to Port
@@ -66,7 +71,7 @@ class Stage:
     """
 
     contract: Contract
-    supervisor: "Supervisor | None"
+    supervisor: Planner
     wire: Wire | None
     ports: Mapping[str, Port]
     at: Callable[[int, Callable[[], None]], None]
@@ -195,10 +200,22 @@ def allowed(item: "Field[Any]") -> str:
         return f"the name of {of_what}"
     if choices := item.metadata.get("choices"):
         return f"one of {', '.join(choices)}"
-    (low, high), unit = item.metadata["bounds"], item.metadata["unit"]
     kind = "a whole number" if item.type is int else "a number"
-    upper = "on" if high == math.inf else f"to {high:g}"
-    return f"{kind} from {low:g} {upper} {unit}".rstrip()
+    return f"{kind} from {_range(item)}"
+
+
+def described(item: "Field[Any]") -> str:
+    """Return a parameter for a list of faults: name, values, and the default in brackets."""
+    values = _range(item) if "bounds" in item.metadata else item.metadata.get("called", allowed(item))
+    default = {MISSING: "", math.inf: " (to the end)"}.get(item.default, f" ({item.default})")
+    return f"`{item.name}` {values}{default}"
+
+
+def _range(item: "Field[Any]") -> str:
+    (low, high), unit = item.metadata["bounds"], item.metadata["unit"]
+    low_text, high_text = (str(bound) if item.type is int else f"{bound:g}" for bound in (low, high))
+    upper = "" if high == math.inf else f" to {high_text}"
+    return f"{low_text}{upper} {unit}".rstrip() + (" on" if high == math.inf else "")
 
 
 def _checked(kind: str, item: "Field[Any]", value: Any) -> Any:

@@ -3,8 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from heapq import heappop, heappush
-from itertools import count
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from dbc.contract import Contract
 from dbc.node import PERIOD_NS, Node
 from firmware_py.node import PHASE_NS, Controller
 from hil.bus import link
+from hil.bus.agenda import Agenda
 from hil.bus.wire import Clock, Port, Wire
 from hil.faults.fault import Fault, Stage
 from hil.run.options import INTERRUPTED, BenchError, Recording, RigOptions, RunOptions, check_bit_rate
@@ -110,8 +110,7 @@ class VirtualSession:
         for node in (supervisor, *nodes):
             self.ports[node.name] = wire.attach(node, CLOCKS[node.name])
         self.stage = Stage(contract, supervisor, wire, self.ports, self.at)
-        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
-        self._entries = count()
+        self._agenda = Agenda(wire)
         self._startup_s = time.perf_counter() - begin_s
         self._wall_s = 0.0
         self._advance(self._power_on)
@@ -121,11 +120,8 @@ class VirtualSession:
         fault.inject(self.stage, origin_ns)
 
     def at(self, bus_ns: int, action: Callable[[], None]) -> None:
-        """Have something done at a bus time, before the wire's events at that time; at once if it is over."""
-        if bus_ns <= self.wire.now_ns:
-            action()
-        else:
-            heappush(self._agenda, (bus_ns, next(self._entries), action))
+        """Have something done at a bus time; see `hil.bus.agenda.Agenda`."""
+        self._agenda.at(bus_ns, action if bus_ns <= self.wire.now_ns else partial(self._do, action))
 
     def run_to(self, period: int) -> None:
         """Go on to the start of a period, counted from power-on."""
@@ -157,20 +153,16 @@ class VirtualSession:
 
     def _run(self, end_ns: int) -> None:
         while not self.ending and self.wire.now_ns < end_ns:
-            self._do_what_is_due()
-            next_ns = self._agenda[0][0] if self._agenda else end_ns
-            self.wire.run(min(self.wire.now_ns + SERVICE_NS, next_ns, end_ns))
+            self._agenda.run(min(self.wire.now_ns + SERVICE_NS, end_ns))
             self._service()
             if self._options.stopped.is_set():
                 self.ending = INTERRUPTED
 
-    def _do_what_is_due(self) -> None:
-        while self._agenda and self._agenda[0][0] <= self.wire.now_ns:
-            _, _, action = heappop(self._agenda)
-            try:
-                action()
-            except ValueError as error:
-                raise BenchError(f"at bus time {self.wire.now_ns / 1e9:.6f} s: {error}") from error
+    def _do(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except ValueError as error:  # too many faults at a time
+            raise BenchError(f"at bus time {self.wire.now_ns / 1e9:.6f} s: {error}") from error
 
     def _advance(self, step: Callable[[], None]) -> None:
         begin_s = time.perf_counter()

@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from dbc.node import PERIOD_NS
 from hil.bus.hub import Hub, NodeGoneError
 from hil.bus.opening import BusSettings
 from hil.bus.wire import Wire
+from hil.faults.catalogue import fault_of_table
 from hil.run.inprocess import Records, VirtualSession, make_wire
 from hil.run.node_processes import NodeProcesses, forget_record, load_record
 from hil.run.options import SIDES, BenchError, InterruptedRunError, Recording, RigOptions, RunOptions
@@ -97,7 +99,9 @@ class LockstepRig(Rig):
             except NodeGoneError as error:
                 self.give_up()
                 raise BenchError(str(error)) from error
-        return LockstepSession(self, wire, supervisor, self.begin_s)
+        session = LockstepSession(self, wire, supervisor, self.begin_s)
+        self.hub.take_fault = session.take_fault
+        return session
 
     def _wait_for_nodes(self) -> None:
         options = self.options
@@ -119,10 +123,19 @@ class LockstepSession(VirtualSession):
 
     def __init__(self, rig: LockstepRig, wire: Wire, supervisor: Supervisor, begin_s: float) -> None:
         self._rig = rig
+        self._injected: list[dict[str, Any]] = []
         nodes = [rig.hub.nodes[name] for name in ("plant", "controller")]
         super().__init__(
             rig.options, rig.contract, wire, supervisor, nodes, rig.records, rig.hub.service, begin_s
         )
+
+    def take_fault(self, table: dict[str, Any]) -> None:
+        """Have a fault that somebody asks for from outside, and note when."""
+        now_ns = self.wire.now_ns
+        fault = fault_of_table(table)
+        self.inject(fault, now_ns)
+        at_s = fault.at_s + (now_ns - self.supervisor.start_ns) / 1e9
+        self._injected.append(fault.table | {"at_s": at_s})
 
     def _advance(self, step: Callable[[], None]) -> None:
         try:
@@ -158,6 +171,7 @@ class LockstepSession(VirtualSession):
         return {
             "exchanges_per_period": exchanges * PERIOD_NS / self.wire.now_ns if self.wire.now_ns else 0.0,
             "listener_drops": hub.dropped,
+            "injected_faults": self._injected,
             "injections": [(time_ns / 1e9, *frame) for time_ns, frame in hub.injections],
         }
 

@@ -141,7 +141,7 @@ FAULT = GOOD + '[[fault]]\nkind = "sensor_bias"\nbias_m = 0.1\n\n[[fault]]\n'
         (GOOD + "fault = [1]\n", "line 4: fault[0] is 1, must be a table"),
         (
             FAULT + "bias_m = 0.1\n",
-            "line 8: missing key 'kind' in fault[1]; it is one of drop, delay",
+            "line 8: missing key 'kind': it is one of drop, delay",
         ),
         (FAULT + 'kind = "bias"\n', "line 9: there is no fault 'bias': choose one of drop, delay, duplicate"),
         (FAULT + "kind = 3\n", "line 9: there is no fault 3: choose one of drop, delay, duplicate"),
@@ -163,7 +163,7 @@ FAULT = GOOD + '[[fault]]\nkind = "sensor_bias"\nbias_m = 0.1\n\n[[fault]]\n'
         ),
         (
             FAULT + 'kind = "drop"\nmessage = "DriveCommand"\ncount = 1.5\n',
-            "line 11: drop: count is 1.5, must be a whole number from 1 to 1e+06 frames",
+            "line 11: drop: count is 1.5, must be a whole number from 1 to 1000000 frames",
         ),
         (
             FAULT + 'kind = "signal_offset"\nmessage = "DriveCommand"\nsignal = "Position"\noffset = 1\n',
