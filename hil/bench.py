@@ -316,7 +316,7 @@ class Bench:
     def write(self, folder: Path, name: str) -> list[Path]:
         """Leave figures, trace, bus log and picture in a folder; return the files."""
         with OutputDirectory(folder, ".log") as directory:
-            return directory.write(self.result(name), self.trace, self.recording.traffic)
+            return directory.write(self.result(name), self.trace, self.recording)
 
     def end(self) -> None:
         """Keep what there is and leave the machine disabled; nothing runs afterwards."""

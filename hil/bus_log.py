@@ -9,13 +9,17 @@ import numpy as np
 from can.io.logger import MESSAGE_WRITERS
 from can.io.player import MESSAGE_READERS
 
-from dbc.frame import ERR_FLAG, Frame
+from dbc.frame import ERR_FLAG, FD_FLAG, Frame
 from hil.bus.messages import to_frame, to_message
 from hil.bus.mf4_on_demand import load_mf4
+from hil.bus.wire_time import PAYLOAD_SHIFT
 from hil.run.options import BenchError
 
 RESOLUTION_NS = 1000
 """To what the times of a log are rounded, ns: what each of the formats keeps."""
+
+_NO_ROOM_FOR = {".trc": ERR_FLAG | FD_FLAG, ".csv": FD_FLAG, ".db": FD_FLAG}
+"""Which frames python-can's writer of a format leaves out, or writes as what they are not."""
 
 _EVERY_CHANNEL = ""
 """Of error frames, as candump's reader does not tell theirs."""
@@ -54,11 +58,28 @@ def check_log_format(suffix: str) -> None:
     _check_package(suffix)
 
 
-def write_bus_log(path: Path, traffic: np.ndarray) -> None:
-    """Write frames, stamped with bus time, in the format of the file's suffix."""
+def write_bus_log(path: Path, traffic: np.ndarray, payloads: np.ndarray | None = None) -> int:
+    """Write frames, stamped with bus time, in the format of the file's suffix.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    traffic, payloads : ndarray
+        As in `hil.run.options.Recording`; the payloads only matter if there are CAN FD frames.
+
+    Returns
+    -------
+    int
+        Frames left out, because the format has no room for them.
+    """
+    unfit = (traffic[:, 1] & np.uint64(_NO_ROOM_FOR.get(_format_of(path), 0))) != 0
     with can.Logger(path) as writer:
-        for time_ns, can_id, dlc, data in traffic.tolist():
+        for time_ns, can_id, dlc, data in traffic[~unfit].tolist():
+            if can_id & FD_FLAG and payloads is not None:
+                data = int.from_bytes(payloads[data >> PAYLOAD_SHIFT].tobytes(), "little")
             writer.on_message_received(to_message(time_ns, Frame(can_id, dlc, data), channel="can0"))
+    return int(unfit.sum())
 
 
 def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
@@ -76,7 +97,7 @@ def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
     BenchError
         If the file cannot be read, holds no frame, or more than one channel.
     """
-    suffix = next((part for part in reversed(path.suffixes) if part != ".gz"), "").lower()
+    suffix = _format_of(path)
     if suffix not in MESSAGE_READERS:
         known = ", ".join(sorted(MESSAGE_READERS))
         raise BenchError(f"{path}: no bus log can be read from {suffix!r}: choose one of {known}")
@@ -104,6 +125,10 @@ def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
         asked = "more than one channel is" if channel is None else f"no channel {channel!r} is"
         raise BenchError(f"{path}: {asked} in it: choose one of {', '.join(sorted(names))} by --channel")
     return BusLog(_traffic([row[1:] for row in rows if row[0] in (channel, _EVERY_CHANNEL)]), left_out)
+
+
+def _format_of(path: Path) -> str:
+    return next((part for part in reversed(path.suffixes) if part != ".gz"), "").lower()
 
 
 def _check_package(suffix: str) -> None:

@@ -27,7 +27,7 @@ from hil.bus.hub import Hub
 from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
 from hil.bus.socketcan import socketcan_status
-from hil.bus.wire import Wire
+from hil.bus.wire import DEFAULT_DATA_BIT_RATE, Wire
 from hil.faults.catalogue import fault_of_text
 from hil.faults.fault import FaultError
 from hil.measure import result_of, trace_of
@@ -41,6 +41,7 @@ from hil.run.options import (
     InterruptedRunError,
     RunOptions,
     check_bit_rate,
+    check_data_bit_rate,
 )
 from hil.run.rig import play
 from hil.run.rigs import RIGS
@@ -116,12 +117,20 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KIND,K=V,...",
         help="what goes wrong; may be repeated",
     )
-    run.add_argument("--mode", choices=RIGS, default="lockstep", help="default lockstep")
+    modes = " ".join(RIGS)
+    run.add_argument("--mode", choices=RIGS, default="lockstep", metavar="MODE", help=f"{modes} (the first)")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
     run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .mf4 ...")
     run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
     run.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; -i: adapter's)")
+    run.add_argument(
+        "--data-bitrate",
+        type=int,
+        default=DEFAULT_DATA_BIT_RATE,
+        metavar="B",
+        help="of CAN FD frames (default 5000000)",
+    )
     run.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
     run.add_argument("-i", "--interface", metavar="I", help="realtime: interface (default: own bus)")
     run.add_argument("-c", "--channel", metavar="C", help="its channel; lockstep: for listeners")
@@ -143,6 +152,13 @@ def _parser() -> argparse.ArgumentParser:
     bus.add_argument("--channel", required=True, help="name to attach to: -i hilbus -c NAME")
     bus.add_argument(
         "--bitrate", type=int, default=DEFAULT_BIT_RATE, metavar="B", help="bit/s (default 1000000)"
+    )
+    bus.add_argument(
+        "--data-bitrate",
+        type=int,
+        default=DEFAULT_DATA_BIT_RATE,
+        metavar="B",
+        help="bit/s behind the bit rate switch of CAN FD frames (default 5000000)",
     )
     bus.add_argument("--parent", type=int, help=argparse.SUPPRESS)
 
@@ -166,7 +182,7 @@ class _OneLineEach(argparse.RawDescriptionHelpFormatter):
     """Help with each option on a line of its own, to fit a screen."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=40)
+        super().__init__(prog, max_help_position=28)
 
 
 def _seconds(text: str) -> float:
@@ -208,6 +224,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 tuning=tuning_of(arguments),
                 record_directory=folder.scratch,
                 bit_rate=bit_rate,
+                data_bit_rate=arguments.data_bitrate,
                 dbc=arguments.dbc,
                 interface=interface,
                 channel=channel,
@@ -221,12 +238,18 @@ def _run(arguments: argparse.Namespace) -> int:
                 recording = play(rig, options)
         trace = trace_of(recording, rig.contract)
         result = result_of(recording, trace, rig.contract, options, rig.mode)
-        files = folder.write(result, trace, recording.traffic)
+        files = folder.write(result, trace, recording)
     if arguments.json:
         print(json.dumps(result, indent=2))
     else:
         Console().print(_table(result))
         print(f"{', '.join(file.name for file in files)} in {out}")
+    if folder.left_out:
+        print(
+            f"hil: {folder.left_out} CAN FD or error frames are not in the bus log: {arguments.log} has no "
+            "room for them, .log, .asc and .blf have",
+            file=sys.stderr,
+        )
     if scenario.limits and not result["limits"]:
         judged = ", ".join(scenario.limits)
         print(
@@ -296,16 +319,17 @@ def _number(value: float | None, form: str) -> str:
 
 def _bus(arguments: argparse.Namespace) -> int:
     check_bit_rate(arguments.bitrate)
+    check_data_bit_rate(arguments.data_bitrate, arguments.bitrate)
+    wire = Wire(arguments.bitrate, data_bit_rate=arguments.data_bitrate)
     stopped = StopFlag.on_signals()
 
     def keep_running() -> bool:
         return not (orphaned(arguments.parent) or stopped.is_set())
 
-    with Hub(Wire(arguments.bitrate), arguments.channel, expected=None) as hub:
+    with Hub(wire, arguments.channel, expected=None) as hub:
         inject_command.take_faults(hub)
-        print(
-            f"{HUB_GREETING} {arguments.channel!r} at {arguments.bitrate} bit/s; Ctrl-C ends it", flush=True
-        )
+        rates = f"{wire.bit_rate} bit/s, CAN FD data at {wire.data_bit_rate} bit/s"
+        print(f"{HUB_GREETING} {arguments.channel!r} at {rates}; Ctrl-C ends it", flush=True)
         hub.run_in_wall_time(keep_running)
         if hub.dropped:
             print(f"hil: {hub.dropped} frames were dropped for slow listeners", file=sys.stderr)

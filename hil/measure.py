@@ -131,10 +131,11 @@ def figures_of(
         "max_mm": error_mm.max if error_mm.known.size else None,
         "chatter_rpm_per_period": chatter_rpm.rms if chatter_rpm.known.size else None,
         "bit_rate": bit_rate,
+        "data_bit_rate": recording.data_bit_rate,
         "bus_load_percent": bus_load_percent(recording, contract, bit_rate),
         "timing": timing.summary(),
         "bus_frames": len(recording.traffic),
-        "bus_sha256": hashlib.sha256(recording.traffic.astype("<u8").tobytes()).hexdigest(),
+        "bus_sha256": _sha256(recording),
         "scenario_start_bus_s": recording.start_ns / 1e9,
         "simulated_s": recording.simulated_s,
         "wall_s": recording.wall_s,
@@ -226,8 +227,8 @@ def left_run(trace: Trace) -> str:
 
 def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) -> float:
     """Return the share of bus time that the frames take at `bit_rate`, the bench channel left out."""
-    _, bits = _carried(recording, contract)
-    return 100.0 * int(bits.sum()) / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
+    _, bits = _carried(recording, contract, bit_rate)
+    return 100.0 * bits.sum() / bit_rate / recording.simulated_s if recording.simulated_s else 0.0
 
 
 def bus_load_of_windows(recording: Recording, contract: Contract, bit_rate: int, window_s: float) -> Series:
@@ -237,18 +238,26 @@ def bus_load_of_windows(recording: Recording, contract: Contract, bit_rate: int,
     """
     if not window_s > 0.0:
         raise ValueError(f"a window is longer than nothing, not {window_s} s")
-    ends_ns, bits = _carried(recording, contract)
+    ends_ns, bits = _carried(recording, contract, bit_rate)
     length_s = recording.simulated_s - recording.start_ns * 1e-9
     edges_s = np.arange(int(length_s / window_s + 1e-9) + 1) * window_s
     inside, _ = np.histogram((ends_ns - float(recording.start_ns)) * 1e-9, edges_s, weights=bits)
     return Series(edges_s[1:], 100.0 * inside / bit_rate / window_s)
 
 
-def _carried(recording: Recording, contract: Contract) -> tuple[np.ndarray, np.ndarray]:
-    """Return ends (bus time, ns) and lengths (bits) of all frames but the bench channel's."""
+def _carried(recording: Recording, contract: Contract, bit_rate: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return ends (bus time, ns) and lengths (bits at `bit_rate`) of all frames but the bench channel's."""
     bench = {message.can_id for message in contract.messages if message.bench_channel}
     carried = recording.traffic[~np.isin(recording.traffic[:, 1], list(bench))]
-    return carried[:, 0], traffic_bits(carried)
+    nominal, fast = traffic_bits(carried).T
+    return carried[:, 0], nominal + fast * (bit_rate / recording.data_bit_rate)
+
+
+def _sha256(recording: Recording) -> str:
+    """Return the hash of every frame's time, id, dlc and data."""
+    digest = hashlib.sha256(recording.traffic.astype("<u8").tobytes())
+    digest.update(recording.payloads.astype("<u8").tobytes())
+    return digest.hexdigest()
 
 
 def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: int, mode: str) -> Timing:

@@ -13,7 +13,7 @@ from can.io.logger import MESSAGE_WRITERS
 
 from hil.bus_log import check_log_format, write_bus_log
 from hil.measure import M_TO_MM, Trace
-from hil.run.options import BenchError
+from hil.run.options import BenchError, Recording
 
 BLUE, ORANGE, GREY, RED = "#0b5394", "#d9730d", "#8a8a8a", "#b02a30"
 
@@ -76,6 +76,11 @@ class OutputDirectory(ResultFolder):
     log_format : str
         Suffix of the bus log that one of python-can's writers knows.
 
+    Attributes
+    ----------
+    left_out : int
+        Frames that were left out of the bus log because its format has no room for them.
+
     Raises
     ------
     BenchError
@@ -85,14 +90,15 @@ class OutputDirectory(ResultFolder):
     def __init__(self, path: Path, log_format: str) -> None:
         check_log_format(log_format)
         super().__init__(path)
+        self.left_out = 0
         self._log_format = log_format
 
-    def write(self, result: dict[str, Any], trace: Trace, traffic: np.ndarray) -> list[Path]:
+    def write(self, result: dict[str, Any], trace: Trace, recording: Recording) -> list[Path]:
         """Write all files and return their paths."""
         made = [self.scratch / "result.json"]
         made[0].write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         made.append(self.scratch / f"bus{self._log_format}")
-        write_bus_log(made[-1], traffic)
+        self.left_out = write_bus_log(made[-1], recording.traffic, recording.payloads)
         if len(trace["time_s"]):
             made.append(self.scratch / "trace.csv")
             header = ",".join(trace)

@@ -338,7 +338,7 @@ class _Frames:
 
     def duration_ns(self, bit_rate: int) -> np.ndarray:
         """Return each frame's time on the wire from its start to its end, ns."""
-        return (traffic_bits(self._rows) - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
+        return (traffic_bits(self._rows)[:, 0] - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
 
     def text(self, index: int) -> str:
         """Return a frame's name, E2E counter and end."""

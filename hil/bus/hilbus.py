@@ -31,11 +31,16 @@ class HilBus(BusABC):
     can_filters : optional
         As in python-can.
     bitrate : int, optional
-        The bit rate this program expects, bit/s. The hub has set it already: another one is refused, because
-        on a real bus such a participant hears nothing and disturbs everybody.
-    timing : can.BitTiming, optional
-        The same, as python-can's bit timing.
-    fd, receive_own_messages : bool
+        The bit rate this program expects, bit/s; with CAN FD the nominal one. The hub has set it already:
+        another one is refused, because on a real bus such a participant hears nothing and disturbs everybody.
+    data_bitrate : int, optional
+        The same behind the bit rate switch of CAN FD frames.
+    timing : can.BitTiming or can.BitTimingFd, optional
+        The same, as python-can's bit timing; that for CAN FD turns `fd` on.
+    fd : bool
+        Send and receive CAN FD frames as well; as on SocketCAN, a program that does not ask for them neither
+        sends nor hears them.
+    receive_own_messages : bool
         Not supported: refused if true.
     greeted : tuple, optional
         A link and the hub's answer from `hil.bus.link.connect`, to be used instead of a new one.
@@ -53,50 +58,61 @@ class HilBus(BusABC):
         bitrate: int | None = None,
         timing: can.BitTiming | can.BitTimingFd | None = None,
         fd: bool = False,
+        data_bitrate: int | None = None,
         receive_own_messages: bool = False,
         greeted: tuple[socket.socket, dict[str, Any]] | None = None,
         **kwargs: Any,
     ) -> None:
         if channel is None:
             raise CanInitializationError("hilbus needs a channel: the NAME of `hil bus --channel NAME`")
-        if fd or isinstance(timing, can.BitTimingFd):
-            raise CanInitializationError("hilbus carries classic CAN only: leave CAN FD out")
         if receive_own_messages:
             raise CanInitializationError(
                 "hilbus does not return a program's own messages: listen with a second bus on the channel"
             )
         self.channel = str(channel)
+        if isinstance(timing, can.BitTimingFd):
+            fd, bitrate, data_bitrate = True, timing.nom_bitrate, timing.data_bitrate
+        elif timing is not None:
+            bitrate = timing.bitrate
         try:
-            self._link, answer = greeted or link.connect(self.channel, {"role": "bus"})
+            self._link, answer = greeted or link.connect(self.channel, {"role": "bus", "fd": bool(fd)})
         except LinkError as error:
             raise CanInitializationError(str(error)) from None
         self.bit_rate: int = answer["bit_rate"]
-        expected = timing.bitrate if timing else bitrate
-        if expected not in (None, self.bit_rate):
-            self._link.close()
-            raise CanInitializationError(
-                f"hilbus channel {self.channel!r} runs at {self.bit_rate} bit/s, not at {expected}: "
-                "leave the bit rate out or give the hub's"
-            )
+        self.data_bit_rate: int = answer["data_bit_rate"]
         self.channel_info = f"hilbus channel {self.channel!r}, {self.bit_rate} bit/s"
-        self._can_protocol = CanProtocol.CAN_20
+        self._expect("runs", self.bit_rate, bitrate)
+        if fd:
+            self.channel_info += f", CAN FD data at {self.data_bit_rate} bit/s"
+            self._expect("switches CAN FD data", self.data_bit_rate, data_bitrate)
+        self._can_protocol = CanProtocol.CAN_FD if fd else CanProtocol.CAN_20
         self._left = ""
         super().__init__(channel=self.channel, can_filters=can_filters, **kwargs)
 
+    def _expect(self, what: str, bit_rate: int, expected: int | None) -> None:
+        if expected not in (None, bit_rate):
+            self._link.close()
+            raise CanInitializationError(
+                f"hilbus channel {self.channel!r} {what} at {bit_rate} bit/s, not at {expected}: "
+                "leave the bit rate out or give the hub's"
+            )
+
     def send(self, msg: Message, timeout: float | None = None) -> None:
-        """Send a classic data frame; blocks while the hub is busy, at most `timeout` s if given.
+        """Send a data frame; blocks while the hub is busy, at most `timeout` s if given.
 
         Raises
         ------
         CanTimeoutError
             If the hub took no frame in that time.
         CanOperationError
-            If it is no classic data frame, or the bus is there no more.
+            If it is no data frame, one of CAN FD on a bus opened without, or the bus is there no more.
         """
         until_s = time.monotonic() + (timeout or 0.0)
         wait_ms = None if timeout is None else timeout * 1e3
         room = select.poll()  # which, other than select, also returns when the link ends
         try:
+            if msg.is_fd and self._can_protocol is not CanProtocol.CAN_FD:
+                raise ValueError("open it with fd=True to send CAN FD frames")
             packet = link.pack_frame(to_frame(msg))
             room.register(self._link, select.POLLOUT)
             while room.poll(wait_ms):

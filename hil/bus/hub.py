@@ -19,7 +19,7 @@ from hil.bus import link
 from hil.bus.agenda import Agenda
 from hil.bus.link import LinkError
 from hil.bus.wire import NEVER, Clock, Port, Wire
-from hil.bus.wire_core import LOG_SENDER, MAX_PORTS
+from hil.bus.wire_core import FLAGS_SHIFT, LOG_HEAD, LOG_SENDER, MAX_PORTS
 
 QUEUE_FRAMES = 100_000
 """Frames a slow listener may lag behind before further ones are dropped, and counted."""
@@ -108,27 +108,35 @@ class Participant:
         Frames it did not get because it was too slow.
     """
 
-    def __init__(self, connection: socket.socket, name: str, sender: int, position: int) -> None:
+    def __init__(self, connection: socket.socket, name: str, sender: int, position: int, fd: bool) -> None:
         self.name = name
         self.sender = sender
         self.position = position
         self.dropped = 0
+        self._fd = fd
         self._link = connection
         connection.setblocking(False)
 
-    def flush(self, log: np.ndarray) -> None:
+    def flush(self, wire: Wire) -> None:
         """Send what the program has room for of what others sent; drop the oldest of too much."""
+        log = wire.log
         self._skip_to(log, len(log) - QUEUE_FRAMES)
         rows = log[self.position :]
         if not len(rows):
             return
         packets, send = rows.data.cast("B"), self._link.send
         try:
-            for at, sender in zip(
-                range(0, len(packets), rows.strides[0]), rows[:, LOG_SENDER].tolist(), strict=True
+            for at, sender, fd in zip(
+                range(0, len(packets), rows.strides[0]),
+                rows[:, LOG_SENDER].tolist(),
+                (rows[:, LOG_HEAD] >> FLAGS_SHIFT).tolist(),
+                strict=True,
             ):
                 if sender != self.sender:
-                    send(packets[at : at + link.TIMED_FRAME_BYTES])
+                    if not fd:
+                        send(packets[at : at + link.TIMED_FRAME_BYTES])
+                    elif self._fd:
+                        send(link.pack_timed(*wire.logged(self.position)))
                 self.position += 1
         except BlockingIOError:
             pass
@@ -278,19 +286,18 @@ class Hub:
         return self.wire.attach(self.nodes[name], clock)
 
     def _pass_on(self) -> None:
-        log = self.wire.log
         for participant, _ in self._participants.values():
-            participant.flush(log)
+            participant.flush(self.wire)
 
     def _flush_to_the_end(self) -> None:
         """Give listeners some time to take the rest; what they do not take is dropped."""
         log = self.wire.log
         deadline_s = time.monotonic() + _LAST_FLUSH_S
         for participant, connection in self._participants.values():
-            participant.flush(log)
+            participant.flush(self.wire)
             while participant.position < len(log) and time.monotonic() < deadline_s:
                 select.select([], [connection], [], _LAST_FLUSH_S)
-                participant.flush(log)
+                participant.flush(self.wire)
             participant.give_up(log)
 
     def _discard_what_all_have_read(self) -> None:
@@ -355,7 +362,7 @@ class Hub:
             return
         sender = next(self._senders)
         name = hello["name"] if hello["role"] == "node" else f"(participant {sender})"
-        participant = Participant(connection, name, sender, len(self.wire.log))
+        participant = Participant(connection, name, sender, len(self.wire.log), bool(hello.get("fd")))
         self._participants[connection.fileno()] = participant, connection
         self._selector.register(connection, selectors.EVENT_READ)
 
@@ -370,6 +377,7 @@ class Hub:
         return {
             "virtual": self._virtual,
             "bit_rate": self.wire.bit_rate,
+            "data_bit_rate": self.wire.data_bit_rate,
             "bus_time_s": self.wire.now_ns / 1e9,
         }
 

@@ -1,8 +1,10 @@
 """Packets between a hub and its participants, over AF_UNIX SEQPACKET sockets in a private directory.
 
-Frames keep SocketCAN's 16-byte layout. A participant says hello in JSON and is answered in JSON; after that
+Frames keep SocketCAN's layout of 16 bytes, CAN FD frames that of 72. A participant says hello in JSON and is
+answered in JSON; after that
 
-- a *bus* participant (any python-can program) sends frames and receives frames with their bus time;
+- a *bus* participant (any python-can program) sends frames and receives frames with their bus time, those of
+  CAN FD if it said so;
 - a *node* in virtual time receives one event at a time and answers each (`dbc.packet`).
 """
 
@@ -15,15 +17,19 @@ import tempfile
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from dbc.frame import EFF_FLAG, Frame
+from can.util import CAN_FD_DLC
 
-PROTOCOL_VERSION = 2
+from dbc.frame import EFF_FLAG, FD_FLAG, Frame
+
+PROTOCOL_VERSION = 3
 MAX_PACKET = 65536
 STOP, SAVE, FORGET = range(3, 6)
 """What a node is told beside events: to write its record and end, to write it, to begin it anew."""
 
 _FRAME = struct.Struct("<IB3xQ")
+_FD_FRAME = struct.Struct("<IBB2x64s")
 _TIMED_FRAME = struct.Struct("<qIB3xQ")
+_TIME = struct.Struct("<q")
 TIMED_FRAME_BYTES = _TIMED_FRAME.size
 
 
@@ -32,36 +38,47 @@ class LinkError(Exception):
 
 
 def pack_frame(frame: Frame) -> bytes:
-    """Return a frame as SocketCAN's `struct can_frame`."""
+    """Return a frame as SocketCAN's `struct can_frame`, or a CAN FD one as its `struct canfd_frame`."""
+    can_id, dlc, data = frame
+    if can_id & FD_FLAG:
+        return _FD_FRAME.pack(can_id & 0xFFFF_FFFF, dlc, can_id >> 32, data.to_bytes(64, "little"))
     return _FRAME.pack(*frame)
 
 
+def _read_frame(packet: bytes) -> Frame:
+    if len(packet) != _FD_FRAME.size:
+        return Frame(*_FRAME.unpack(packet))
+    can_id, dlc, flags, data = _FD_FRAME.unpack(packet)
+    return Frame(can_id | flags << 32 | FD_FLAG, dlc, int.from_bytes(data, "little"))
+
+
 def unpack_frame(packet: bytes) -> Frame:
-    """Return the frame in a `struct can_frame`.
+    """Return the frame in a `struct can_frame` or `struct canfd_frame`.
 
     Raises
     ------
     ValueError
-        If it is not a classic data frame.
+        If it is not a data frame.
     """
-    if len(packet) != _FRAME.size:
-        raise ValueError(f"{len(packet)} bytes are no classic frame")
-    can_id, dlc, data = _FRAME.unpack(packet)
-    highest = EFF_FLAG | 0x1FFF_FFFF if can_id & EFF_FLAG else 0x7FF
-    if dlc > 8 or can_id > highest:
-        raise ValueError(f"id {can_id:#x} with {dlc} bytes is no classic data frame")
+    if len(packet) not in (_FRAME.size, _FD_FRAME.size):
+        raise ValueError(f"{len(packet)} bytes are no frame")
+    can_id, dlc, data = _read_frame(packet)
+    word, flags = can_id & 0xFFFF_FFFF, can_id >> 32
+    highest = EFF_FLAG | 0x1FFF_FFFF if word & EFF_FLAG else 0x7FF
+    if dlc not in (CAN_FD_DLC if flags else range(9)) or word > highest or flags > 7:
+        raise ValueError(f"id {word:#x} with {dlc} bytes is no data frame")
     return Frame(can_id, dlc, data & ((1 << 8 * dlc) - 1))
 
 
 def pack_timed(time_ns: int, frame: Frame) -> bytes:
     """Return a frame behind its bus time in ns."""
-    return _TIMED_FRAME.pack(time_ns, *frame)
+    return _TIME.pack(time_ns) + pack_frame(frame)
 
 
 def unpack_timed(packet: bytes) -> tuple[int, Frame]:
     """Return bus time in ns and frame."""
-    time_ns, can_id, dlc, data = _TIMED_FRAME.unpack(packet)
-    return time_ns, Frame(can_id, dlc, data)
+    (time_ns,) = _TIME.unpack_from(packet)
+    return time_ns, _read_frame(packet[_TIME.size :])
 
 
 @runtime_checkable

@@ -49,8 +49,12 @@ def bus_settings(interface: str | None, channel: str | None, bit_rate: int | Non
     )
 
 
-def open_bus(interface: str | None, channel: str | None, bit_rate: int | None) -> can.BusABC:
+def open_bus(
+    interface: str | None, channel: str | None, bit_rate: int | None, fd: bool = False
+) -> can.BusABC:
     """Open a bus; None, and all that only this adapter has, is looked up in python-can's configuration.
+
+    With `fd`, CAN FD frames are heard as well, whatever the configuration says.
 
     Raises
     ------
@@ -58,6 +62,8 @@ def open_bus(interface: str | None, channel: str | None, bit_rate: int | None) -
         If it cannot be opened, whatever its driver raises; one line that says what to do.
     """
     configuration = _configuration(interface, channel, bit_rate)
+    if fd:
+        configuration["fd"] = True
     name, where = configuration["interface"], configuration["channel"]
     try:
         with _raised_not_logged():

@@ -12,13 +12,14 @@ from functools import partial
 
 import numpy as np
 
-from dbc.frame import Frame
+from dbc.frame import FD_FLAG, Frame
 from dbc.jit import entry_point
 from dbc.node import Actions, Node
 from dbc.packet import START, answers_of, pack_actions_into, unpack_actions
 from hil.bus import confinement, link
 from hil.bus import wire_core as at
 from hil.bus.wire_core import NEVER, arbitration_key
+from hil.bus.wire_time import PAYLOAD_SHIFT, fd_bits, fd_log_data, payload_words
 
 __all__ = ["NEVER", "Clock", "FrameFault", "Port", "Wire", "arbitration_key"]
 
@@ -26,6 +27,10 @@ _advance, _hand_over = entry_point(at.advance), entry_point(at.hand_over)
 _local_ns, _bus_ns = entry_point(at.local_ns), entry_point(at.bus_ns)
 _QUEUE_ROWS = 4096
 _LOG_ROWS = 1 << 14
+_PAYLOADS = 1 << 31
+
+DEFAULT_DATA_BIT_RATE = 5_000_000
+"""Bit/s: the highest for which ISO 11898-2:2016 specifies transceivers."""
 
 Edit = Callable[[Actions], Actions]
 """Changes what a node wants before the wire hears of it; times are those of the node's own clock."""
@@ -49,6 +54,8 @@ class Clock:
 
 class FrameFault(IntEnum):
     """What can happen to a frame between its node and the wire; the argument in brackets.
+
+    Only `DESTROY` strikes CAN FD frames, too.
 
     Attributes
     ----------
@@ -116,21 +123,32 @@ class Port:
 
 
 class Wire:
-    """A classic CAN bus between nodes.
+    """A CAN bus between nodes.
+
+    Nodes are classic: they let CAN FD frames pass, unheard and undestroyed. Such frames come from senders
+    that are no nodes.
 
     Parameters
     ----------
     bit_rate : int
-        Bit/s.
+        Bit/s; of CAN FD frames the nominal one.
     out_of_band : frozenset of int
         Ids of the bench channel: delivered the moment they are sent, without using the bus.
+    data_bit_rate : int
+        Bit/s of CAN FD frames behind their bit rate switch.
     """
 
-    def __init__(self, bit_rate: int, out_of_band: frozenset[int] = frozenset()) -> None:
+    def __init__(
+        self,
+        bit_rate: int,
+        out_of_band: frozenset[int] = frozenset(),
+        data_bit_rate: int = DEFAULT_DATA_BIT_RATE,
+    ) -> None:
         self.bit_rate = bit_rate
+        self.data_bit_rate = data_bit_rate
         self._core = np.zeros(at.CORE_SIZE, np.int64)
         self._core[at.END] = NEVER
-        self._core[at.BIT_RATE] = bit_rate
+        self._core[[at.BIT_RATE, at.DATA_BIT_RATE]] = bit_rate, data_bit_rate
         self._port_words = np.zeros((at.MAX_PORTS, at.PORT_SIZE), np.int64)
         self._filters = np.zeros((0, at.FILTER_SIZE), np.int64)
         self._queue = np.zeros((_QUEUE_ROWS, at.QUEUE_SIZE), np.int64)
@@ -139,6 +157,8 @@ class Wire:
         self._faults = np.zeros((at.MAX_FAULTS, at.FAULT_SIZE), np.int64)
         self._out_of_band = np.array(sorted(out_of_band), np.int64)
         self._answer = bytearray(link.MAX_PACKET)
+        self._payloads: dict[int, np.ndarray] = {}
+        self._next_payload = 0
         self._advance = partial(
             _advance,
             self._core,
@@ -162,11 +182,33 @@ class Wire:
 
     @property
     def traffic(self) -> np.ndarray:
-        """Frames that have ended, uint64 of shape (frames, 4): bus time of the end (ns), id, dlc, data."""
-        log = self.log.view(np.uint64)
-        head = log[:, at.LOG_HEAD]
-        columns = (log[:, at.LOG_TIME], head & np.uint64(0xFFFF_FFFF), head >> np.uint64(32))
-        return np.column_stack([*columns, log[:, at.LOG_DATA]])
+        """Frames that have ended, uint64 of shape (frames, 4): bus time of the end (ns), id, dlc, data.
+
+        Of CAN FD frames, which have `dbc.frame.FD_FLAG` in their id, the data are as `wire_time.fd_log_data`
+        says, the row being one of `payloads`.
+        """
+        head = self.log[:, at.LOG_HEAD]
+        can_id = head & 0xFFFF_FFFF | head >> at.FLAGS_SHIFT << 32
+        data = self.log[:, at.LOG_DATA].copy()
+        fd = np.flatnonzero(can_id & FD_FLAG)
+        data[fd] = data[fd] & ((1 << PAYLOAD_SHIFT) - 1) | np.arange(len(fd)) << PAYLOAD_SHIFT
+        return np.column_stack([self.log[:, at.LOG_TIME], can_id, head >> 32 & 0xFF, data]).view(np.uint64)
+
+    @property
+    def payloads(self) -> np.ndarray:
+        """Payloads of the CAN FD frames of `traffic` in their order, uint64 of shape (frames, 8)."""
+        log = self.log
+        of_fd = log[log[:, at.LOG_HEAD] >> at.FLAGS_SHIFT > 0, at.LOG_DATA] >> PAYLOAD_SHIFT
+        rows = [self._payloads[number] for number in of_fd.tolist()]
+        return np.array(rows, np.uint64).reshape(-1, 8)
+
+    def logged(self, row: int) -> tuple[int, Frame]:
+        """Return end (bus time, ns) and frame in a row of the log."""
+        time_ns, head, data, _ = self.log[row].tolist()
+        can_id = head & 0xFFFF_FFFF | head >> at.FLAGS_SHIFT << 32
+        if can_id & FD_FLAG:
+            data = int.from_bytes(self._payloads[data >> PAYLOAD_SHIFT].tobytes(), "little")
+        return time_ns, Frame(can_id, head >> 32 & 0xFF, data % (1 << 64) if data < 0 else data)
 
     def attach(self, node: "Node | link.Askable", clock: Clock | None = None) -> Port:
         """Add a node; it hears the frames that end from now on.
@@ -264,8 +306,6 @@ class Wire:
             A port's order; a number from `wire_core.MAX_PORTS` on for a sender that is no node.
         """
         self._make_room()
-        can_id, dlc, data = frame
-        head = can_id | dlc << 32
         _hand_over(
             self._core,
             self._port_words,
@@ -274,8 +314,7 @@ class Wire:
             self._out_of_band,
             sender,
             ready_ns,
-            head,
-            _signed(data),
+            *self._words(frame),
         )
 
     def withdraw(self, sender: int) -> None:
@@ -360,7 +399,7 @@ class Wire:
             raise ValueError("one sender is babbling already: wait until it ends")
         self._core[[at.BABBLE_GAP, at.BABBLE_UNTIL]] = gap_ns, self.now_ns + duration_ns
         self._make_room()
-        at.enqueue(self._core, self._queue, at.BABBLER, frame.can_id | frame.dlc << 32, _signed(frame.data))
+        at.enqueue(self._core, self._queue, at.BABBLER, *self._words(frame))
 
     def force_bus_off(self, port: Port) -> None:
         """Take a node's CAN controller off the bus now, as 32 destroyed frames would.
@@ -402,6 +441,27 @@ class Wire:
         kept = self.log[rows:].copy()
         self._log[: len(kept)] = kept
         self._core[at.LOGGED] = len(kept)
+        if self._payloads:
+            self._discard_payloads()
+
+    def _words(self, frame: Frame) -> tuple[int, int]:
+        """Return a frame's head and data, its payload kept if it is a CAN FD one."""
+        can_id, dlc, data = frame
+        if not can_id & FD_FLAG:
+            return can_id | dlc << 32, _signed(data)
+        payload = payload_words(data)
+        number, self._next_payload = self._next_payload, (self._next_payload + 1) % _PAYLOADS
+        self._payloads[number] = payload
+        head = can_id & 0xFFFF_FFFF | dlc << 32 | can_id >> 32 << at.FLAGS_SHIFT
+        return head, fd_log_data(fd_bits(can_id, dlc, payload), number)
+
+    def _discard_payloads(self) -> None:
+        """Forget the payloads of frames that are in no log or queue and not on the wire."""
+        queued = self._queue[: self._core[at.QUEUED], [at.HEAD, at.DATA]]
+        on_wire = self._core[[at.ON_WIRE_HEAD, at.ON_WIRE_DATA]]
+        there = np.vstack([self.log[:, [at.LOG_HEAD, at.LOG_DATA]], queued, on_wire])
+        numbers = there[there[:, 0] >> at.FLAGS_SHIFT > 0, 1] >> PAYLOAD_SHIFT
+        self._payloads = {number: self._payloads[number] for number in set(numbers.tolist())}
 
     def _go_on(self, length: int, order: int, until_ns: int) -> None:
         """Do what the node at a port has answered, then go on to `until_ns`."""

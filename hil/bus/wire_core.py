@@ -1,7 +1,8 @@
 """The wire's events, compiled: who speaks when, and which node has to be asked next.
 
 All of a wire's state is in integer arrays; frames are SocketCAN's 16 bytes as two 64-bit words: the *head*
-(identifier, length << 32) and the data.
+(identifier, length << 32) and the data. A CAN FD frame has its flags in bits 40 to 42 of the head, and for
+its data the word of `hil.bus.wire_time.fd_log_data`: the payload is elsewhere.
 """
 
 from typing import Any
@@ -30,10 +31,20 @@ from hil.bus.confinement import (
     next_random,
 )
 from hil.bus.link import MAX_PACKET
-from hil.bus.wire_time import ERROR_BITS_BYTE, INTERMISSION_BITS, classic_bits
+from hil.bus.wire_time import (
+    ERROR_BITS_BYTE,
+    ERROR_MORE_BITS_BYTE,
+    FAST_SHIFT,
+    INTERMISSION_BITS,
+    LENGTH_MASK,
+    UNSTUFFED_BITS,
+    classic_bits,
+)
 
 NEVER = 1 << 62
 _NS_PER_S = 1_000_000_000
+FLAGS_SHIFT = 40
+"""Of the head of a CAN FD frame; a classic one has no bits from here on."""
 
 # words of the wire
 (
@@ -53,6 +64,7 @@ _NS_PER_S = 1_000_000_000
     ON_WIRE_READY,
     ON_WIRE_ORDER,
     ON_WIRE_BAD_BITS,  # bits up to the end of the error frame that destroys it, 0 if it arrives
+    ON_WIRE_BAD_FAST,  # those of them that are at the data rate come on top
     BUS_OFF,  # whether a node is
     COUNTED_UNTIL,  # bus time up to which idle bits have been counted for bus-off nodes, ns
     NOISE_UNTIL,  # end of the noise, ns
@@ -60,8 +72,9 @@ _NS_PER_S = 1_000_000_000
     NOISE_STATE,  # of its random numbers
     BABBLE_GAP,  # from the end of a babbled frame's intermission to the next frame, ns
     BABBLE_UNTIL,  # bus time from which no further one is handed over, ns
-) = range(23)
-CORE_SIZE = 23
+    DATA_BIT_RATE,
+) = range(25)
+CORE_SIZE = 25
 
 MAX_PORTS = 48
 BABBLER = 1 << 30
@@ -141,11 +154,13 @@ def arbitration_key(can_id):  # type: ignore[no-untyped-def]
 
 @register_jitable
 def _deliver(core, ports, filters, log, mail, head, data, sender):  # type: ignore[no-untyped-def]
-    """Log a frame and put it into the mail of every port that accepts it."""
+    """Log a frame and put it into the mail of every port that accepts it; CAN FD is for none."""
     now_ns = core[NOW]
     row = log[core[LOGGED]]
     row[LOG_TIME], row[LOG_HEAD], row[LOG_DATA], row[LOG_SENDER] = now_ns, head, data, sender
     core[LOGGED] += 1
+    if head >> FLAGS_SHIFT:
+        return
     can_id = head & ID_MASK
     served = sender
     for entry in range(core[FILTERS]):
@@ -186,6 +201,15 @@ def _take(core, queue, entry):  # type: ignore[no-untyped-def]
 @register_jitable
 def _bits_ns(core, bits):  # type: ignore[no-untyped-def]
     return bits * _NS_PER_S // core[BIT_RATE]
+
+
+@register_jitable
+def _both_ns(core, bits, fast):  # type: ignore[no-untyped-def]
+    """Return how long bits at the nominal and bits at the data rate take."""
+    if fast == 0:
+        return _bits_ns(core, bits)
+    rate, data_rate = core[BIT_RATE], core[DATA_BIT_RATE]
+    return (bits * data_rate + fast * rate) * _NS_PER_S // (rate * data_rate)
 
 
 @register_jitable
@@ -241,16 +265,23 @@ def _arbitrate(core, ports, queue, faults):  # type: ignore[no-untyped-def]
             winner = entry
     row = _take(core, queue, winner)
     head = row[HEAD]
-    bits = classic_bits(head & ID_MASK, head >> 32, np.uint64(row[DATA]))
+    fast = 0
+    if head >> FLAGS_SHIFT:
+        bits, fast = row[DATA] & LENGTH_MASK, row[DATA] >> FAST_SHIFT & LENGTH_MASK
+    else:
+        bits = classic_bits(head & ID_MASK, head >> 32, np.uint64(row[DATA]))
     core[ON_WIRE_HEAD], core[ON_WIRE_DATA], core[ON_WIRE_SENDER] = head, row[DATA], row[SENDER]
     core[ON_WIRE_READY], core[ON_WIRE_ORDER] = row[READY], row[ORDER]
-    bad_bit = _bad_bit(core, faults, head & ID_MASK, bits - INTERMISSION_BITS)
-    core[ON_WIRE_BAD_BITS] = 0
+    bad_bit = _bad_bit(core, faults, head & ID_MASK, bits + fast - INTERMISSION_BITS)
+    core[ON_WIRE_BAD_BITS] = core[ON_WIRE_BAD_FAST] = 0
     if bad_bit >= 0:
-        core[ON_WIRE_BAD_BITS] = bad_bit + 1 + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS
+        if fast:  # these follow the bit rate switch, before the acknowledgement
+            fast = min(max(bad_bit + 1 - (bits - UNSTUFFED_BITS + 1), 0), fast)
+        core[ON_WIRE_BAD_BITS] = bad_bit + 1 - fast + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS
+        core[ON_WIRE_BAD_FAST] = fast
         bits = core[ON_WIRE_BAD_BITS] + INTERMISSION_BITS
-    core[END] = now_ns + _bits_ns(core, bits - INTERMISSION_BITS)
-    core[IDLE] = now_ns + _bits_ns(core, bits)
+    core[END] = now_ns + _both_ns(core, bits - INTERMISSION_BITS, fast)
+    core[IDLE] = now_ns + _both_ns(core, bits, fast)
 
 
 @register_jitable
@@ -284,7 +315,9 @@ def _destroyed(core, ports, queue, log):  # type: ignore[no-untyped-def]
     row = log[core[LOGGED]]
     row[LOG_TIME], row[LOG_SENDER] = core[NOW], sender
     row[LOG_HEAD] = ERR_FLAG | ERROR_CLASSES | (ERROR_BUS_OFF if is_off else 0) | 8 << 32
-    data = _ERROR_BIT_TYPE << 16 | core[ON_WIRE_BAD_BITS] << 8 * ERROR_BITS_BYTE
+    bits = core[ON_WIRE_BAD_BITS]
+    data = _ERROR_BIT_TYPE << 16 | (bits & 0xFF) << 8 * ERROR_BITS_BYTE | core[ON_WIRE_BAD_FAST]
+    data |= (bits >> 8) << 8 * ERROR_MORE_BITS_BYTE
     if sender < core[PORTS]:
         data |= min(ports[sender, TEC], 255) << 8 * _TEC_BYTE
         data |= ports[sender, REC] << 8 * _REC_BYTE
@@ -362,6 +395,9 @@ def _hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, 
         _let_recover(core, ports)
         if ports[sender, SEQUENCES_LEFT]:
             return
+    if head >> FLAGS_SHIFT:
+        _enqueue(core, queue, max(ready_ns, core[NOW]), sender, head, data)
+        return
     for number in range(faults.shape[0]):
         if faults[number, FAULT_COUNT] == 0 or faults[number, FAULT_ID] != can_id:
             continue

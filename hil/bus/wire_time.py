@@ -1,24 +1,34 @@
 """Exact length of frames on the wire, in bits, stuff bits included (ISO 11898-1).
 
-Lengths run from the start of frame to the end of the three bits of intermission.
+Lengths run from the start of frame to the end of the three bits of intermission. Of a CAN FD frame with a bit
+rate switch some bits are at the nominal rate and others at the data rate.
 """
 
 from typing import Any
 
 import can
 import numpy as np
-from can.util import dlc2len, len2dlc
+from can.util import CAN_FD_DLC, dlc2len, len2dlc
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from dbc.frame import EFF_FLAG, ERR_FLAG
+from dbc.frame import BRS_FLAG, EFF_FLAG, ERR_FLAG, ESI_FLAG, FD_FLAG
 from dbc.jit import njit
 
 RTR_FLAG = 0x4000_0000
 """Set in an identifier word for a remote frame, as in SocketCAN's `can_id`."""
 
 INTERMISSION_BITS = 3
-ERROR_BITS_BYTE = 5
-"""Byte of an error frame's data in a log: bits from the start of what it destroyed to its own end."""
+ERROR_BITS_BYTE, ERROR_MORE_BITS_BYTE = 5, 4
+"""Low and high byte, in an error frame's data in a log, of the bits at the nominal rate from the start of
+what it destroyed to its own end; those at the data rate are in bytes 0 and 1."""
+
+FD_LENGTHS = np.array(CAN_FD_DLC)
+"""Number of data bytes of each DLC."""
+
+FAST_SHIFT, PAYLOAD_SHIFT, LENGTH_MASK = 10, 20, (1 << 10) - 1
+"""Of a CAN FD frame in a log the data word holds its length, bits at the nominal rate lowest, then those at
+the data rate, then the row of its payload."""
 
 CRC15_POLYNOMIAL = 0x4599
 UNSTUFFED_BITS = 13
@@ -116,44 +126,95 @@ def worst_case_bits(can_id: int, dlc: int) -> int:
     return stuffed + (stuffed - 1) // 4 + UNSTUFFED_BITS
 
 
-def traffic_bits(traffic: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the length in bits of each frame of a log, error frames with what they destroyed.
+@register_jitable
+def _stuff(bits, count, run, level):  # type: ignore[no-untyped-def]
+    """Return the stuff bits of a sequence, most significant bit first, and the last bit's run and level."""
+    stuff_bits = 0
+    for position in range(count - 1, -1, -1):
+        bit = bits >> position & 1
+        run = run + 1 if bit == level else 1
+        level = bit
+        if run == 5:
+            stuff_bits += 1
+            run, level = 1, 1 - bit
+    return stuff_bits, run, level
 
-    Its rows are time, id, dlc, data.
-    """
-    return np.array([_logged_bits(*frame) for _, *frame in traffic.tolist()], np.int64)
 
-
-def _logged_bits(can_id: int, dlc: int, data: int) -> int:
-    if can_id & ERR_FLAG:
-        return (data >> 8 * ERROR_BITS_BYTE & 0xFF) + INTERMISSION_BITS
-    bits: int = classic_bits(can_id, dlc, data)
-    return bits
-
-
-def fd_bits(message: can.Message) -> tuple[int, int]:
+@njit("UniTuple(int64, 2)(int64, int64, uint64[::1])", depends=("dbc.frame",))
+def fd_bits(can_id, length, payload):  # type: ignore[no-untyped-def]
     """Return the length of an ISO CAN FD frame as (bits at the nominal rate, bits at the data rate).
 
     Without a bit rate switch all bits are at the nominal rate. Dynamic stuffing ends with the data field:
     after five equal bits at its very end the fixed stuff bit of the CRC field takes the dynamic one's place.
-    """
-    dlc = len2dlc(message.dlc)
-    length = dlc2len(dlc)
-    data = int.from_bytes(bytes(message.data).ljust(length, b"\0"), "big")
-    if message.is_extended_id:
-        identifier = f"{message.arbitration_id >> 18:011b}11{message.arbitration_id & 0x3FFFF:018b}0"
-    else:
-        identifier = f"{message.arbitration_id:011b}00"
-    arbitration = f"0{identifier}10{message.bitrate_switch:b}"
-    control = f"{message.error_state_indicator:b}{dlc:04b}"
-    payload = f"{data:0{8 * length}b}" if length else ""
-    crc_field = 4 + 17 + 6 if length <= 16 else 4 + 21 + 7
 
-    nominal_stuff_bits = _stuff_bits(arbitration)
-    stuff_bits = _stuff_bits((arbitration + control + payload)[:-1])
-    nominal = len(arbitration) + nominal_stuff_bits + UNSTUFFED_BITS - 1
-    fast = len(control) + len(payload) + stuff_bits - nominal_stuff_bits + crc_field + 1
-    return (nominal, fast) if message.bitrate_switch else (nominal + fast, 0)
+    Parameters
+    ----------
+    can_id : int
+        Identifier with its flags, as in `dbc.frame.Frame`.
+    length : int
+        Number of data bytes, one of `FD_LENGTHS`.
+    payload : array of 8 uint64
+        Data, byte 0 in the low eight bits of the first.
+    """
+    switched = 1 if can_id & BRS_FLAG else 0
+    if can_id & EFF_FLAG:
+        identifier = (can_id >> 18 & 0x7FF) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1
+        nominal = 36
+    else:
+        identifier = (can_id & 0x7FF) << 2
+        nominal = 17
+    arbitration = identifier << 3 | 0b10 << 1 | switched
+    last = np.int64(np.searchsorted(FD_LENGTHS, length))
+    control = (1 if can_id & ESI_FLAG else 0) << 4 | last
+    arbitration_stuff_bits, run, level = _stuff(arbitration, nominal, 0, 1)
+    stuff_bits, run, level = _stuff(control, 5, run, level)
+    for index in range(length):
+        last = np.int64(payload[index >> 3] >> np.uint64(8 * (index & 7))) & 0xFF
+        more, run, level = _stuff(last, 8, run, level)
+        stuff_bits += more
+    if level != last & 1:  # a stuff bit came after the very last one
+        stuff_bits -= 1
+    crc_bits = 4 + 17 + 6 if length <= 16 else 4 + 21 + 7
+    nominal += arbitration_stuff_bits + UNSTUFFED_BITS - 1
+    fast = 5 + 8 * length + stuff_bits + crc_bits + 1
+    return (nominal, fast) if switched else (nominal + fast, 0)
+
+
+def payload_words(data: int) -> NDArray[np.uint64]:
+    """Return a payload of up to 64 bytes, byte 0 in its low eight bits, as 8 words."""
+    return np.frombuffer(bytearray(data.to_bytes(64, "little")), np.uint64)
+
+
+def fd_log_data(lengths: tuple[int, int], payload: int) -> int:
+    """Return the data word of a CAN FD frame in a log: what `fd_bits` says, and the row of its payload."""
+    nominal, fast = lengths
+    return payload << PAYLOAD_SHIFT | fast << FAST_SHIFT | nominal
+
+
+def traffic_bits(traffic: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the length of each frame of a log, error frames with what they destroyed.
+
+    Parameters
+    ----------
+    traffic : ndarray, shape (frames, 4)
+        Time, id, dlc, data; see `hil.bus.wire.Wire.traffic`.
+
+    Returns
+    -------
+    ndarray of int64, shape (frames, 2)
+        Bits at the nominal rate and at the data rate.
+    """
+    lengths = [_logged_bits(*frame) for _, *frame in traffic.tolist()]
+    return np.array(lengths, np.int64).reshape(-1, 2)
+
+
+def _logged_bits(can_id: int, dlc: int, data: int) -> tuple[int, int]:
+    if can_id & ERR_FLAG:
+        nominal = data >> 8 * ERROR_BITS_BYTE & 0xFF | (data >> 8 * ERROR_MORE_BITS_BYTE & 0xFF) << 8
+        return nominal + INTERMISSION_BITS, data & 0xFFFF
+    if can_id & FD_FLAG:
+        return data & LENGTH_MASK, data >> FAST_SHIFT & LENGTH_MASK
+    return classic_bits(can_id, dlc, data), 0
 
 
 def frame_bits(message: can.Message) -> int:
@@ -166,23 +227,14 @@ def frame_bits(message: can.Message) -> int:
     """
     if message.is_error_frame:
         raise ValueError("an error frame has no fixed length")
-    if message.is_fd:
-        return sum(fd_bits(message))
-    flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
+    flags = EFF_FLAG if message.is_extended_id else 0
     data = int.from_bytes(message.data, "little")
+    if message.is_fd:
+        flags |= (BRS_FLAG if message.bitrate_switch else 0) | (
+            ESI_FLAG if message.error_state_indicator else 0
+        )
+        length = dlc2len(len2dlc(message.dlc))
+        return sum(fd_bits(message.arbitration_id | flags, length, payload_words(data)))
+    flags |= RTR_FLAG if message.is_remote_frame else 0
     bits: int = classic_bits(message.arbitration_id | flags, message.dlc, data)
     return bits
-
-
-def _stuff_bits(bits: str) -> int:
-    """Return the number of stuff bits that a sequence of '0' and '1' gets."""
-    stuff_bits = run = 0
-    level = ""
-    for bit in bits:
-        run = run + 1 if bit == level else 1
-        level = bit
-        if run == 5:
-            stuff_bits += 1
-            run = 1
-            level = "1" if bit == "0" else "0"
-    return stuff_bits

@@ -12,9 +12,17 @@ from dbc.node import PERIOD_NS, Node
 from firmware_py.node import PHASE_NS, Controller
 from hil.bus import link
 from hil.bus.agenda import Agenda
-from hil.bus.wire import Clock, Port, Wire
+from hil.bus.wire import DEFAULT_DATA_BIT_RATE, Clock, Port, Wire
 from hil.faults.fault import Fault, Stage
-from hil.run.options import INTERRUPTED, BenchError, Recording, RigOptions, RunOptions, check_bit_rate
+from hil.run.options import (
+    INTERRUPTED,
+    BenchError,
+    Recording,
+    RigOptions,
+    RunOptions,
+    check_bit_rate,
+    check_data_bit_rate,
+)
 from hil.run.rig import Rig, play
 from hil.supervisor import Supervisor
 from plant_sim.node import Plant
@@ -57,7 +65,7 @@ class InprocessRig(Rig):
         return VirtualSession(
             self.options,
             self.contract,
-            make_wire(self.contract, bit_rate),
+            make_wire(self.contract, bit_rate, self.options.data_bit_rate),
             supervisor,
             [plant, firmware],
             records,
@@ -141,6 +149,8 @@ class VirtualSession:
             startup_s=self._startup_s,
             ending=self.ending,
             broken=self.broken,
+            payloads=self.wire.payloads,
+            data_bit_rate=self.wire.data_bit_rate,
             notes=self._notes(),
         )
 
@@ -175,8 +185,9 @@ class VirtualSession:
         return {}
 
 
-def make_wire(contract: Contract, bit_rate: int) -> Wire:
+def make_wire(contract: Contract, bit_rate: int, data_bit_rate: int = DEFAULT_DATA_BIT_RATE) -> Wire:
     """Return a wire on which the contract's bench channel is out of band."""
     check_bit_rate(bit_rate)
+    check_data_bit_rate(data_bit_rate, bit_rate)
     out_of_band = frozenset(message.can_id for message in contract.messages if message.bench_channel)
-    return Wire(bit_rate, out_of_band)
+    return Wire(bit_rate, out_of_band, data_bit_rate)

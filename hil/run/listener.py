@@ -9,7 +9,9 @@ from threading import Thread
 import can
 import numpy as np
 
+from dbc.frame import FD_FLAG, Frame
 from hil.bus.messages import to_frame
+from hil.bus.wire_time import fd_bits, fd_log_data, payload_words
 from hil.run.realtime import shared_ns
 
 _POLL_S = 0.05
@@ -40,6 +42,7 @@ class Listener:
         self._bus = bus
         self._stopping = False
         self._heard: list[tuple[int, int, int, int, int]] = []  # heard, stamped (ns), id, dlc, data
+        self._payloads: list[np.ndarray] = []
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -59,6 +62,11 @@ class Listener:
     def times_ns(self, can_id: int) -> list[int]:
         """Return the bus's own time stamps of a message, ns."""
         return [stamp_ns for _, stamp_ns, heard_id, _, _ in self._heard if heard_id == can_id]
+
+    @property
+    def payloads(self) -> np.ndarray:
+        """Payloads of CAN FD frames; see `hil.run.options.Recording`."""
+        return np.array(self._payloads, np.uint64).reshape(-1, 8)
 
     def traffic(self, ratio: Fraction) -> np.ndarray:
         """Return what was heard on the nodes' time base; see `hil.run.options.Recording`.
@@ -80,8 +88,17 @@ class Listener:
             self.raised = error
 
     def _take(self, message: can.Message) -> None:
-        if not (message.is_error_frame or message.is_remote_frame or message.is_fd):
+        if not (message.is_error_frame or message.is_remote_frame):
             frame = to_frame(message)
+            if frame.can_id & FD_FLAG:
+                frame = self._kept(frame)
             now_ns = time.monotonic_ns()
             self.newest_ns[frame.can_id] = now_ns
             self._heard.append((now_ns, round(message.timestamp * 1e9), *frame))
+
+    def _kept(self, frame: Frame) -> Frame:
+        """Keep a CAN FD frame's payload; return the frame with what a log has for its data."""
+        payload = payload_words(frame.data)
+        self._payloads.append(payload)
+        lengths = fd_bits(frame.can_id, frame.dlc, payload)
+        return frame._replace(data=fd_log_data(lengths, len(self._payloads) - 1))

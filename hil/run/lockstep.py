@@ -81,7 +81,7 @@ class LockstepRig(Rig):
     def _open(self, stack: ExitStack) -> None:
         options, bit_rate = self.options, self.bit_rate
         channel = options.channel or f"run-{os.getpid()}"
-        wire = make_wire(self.contract, bit_rate)
+        wire = make_wire(self.contract, bit_rate, self.options.data_bit_rate)
         self.hub = stack.enter_context(Hub(wire, channel, SIDES, options.answer_timeout_s))
         bus = BusSettings("hilbus", channel, bit_rate)
         self.processes = stack.enter_context(NodeProcesses(options, bus))
@@ -90,7 +90,7 @@ class LockstepRig(Rig):
             _set_affinity(pid, _one_core())
 
     def _begin(self, supervisor: Supervisor, bit_rate: int) -> "LockstepSession":
-        wire = make_wire(self.contract, bit_rate)
+        wire = make_wire(self.contract, bit_rate, self.options.data_bit_rate)
         self.hub.lead_to(wire)
         for name in SIDES:
             forget_record(self.options, name)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.chosen_tuning import ChosenTuning, chosen_tuning
+from hil.bus.wire import DEFAULT_DATA_BIT_RATE
 from hil.run.stopping import StopFlag
 from hil.scenario import Scenario, controller_of
 from plant_sim.machine import Machine
@@ -43,6 +44,20 @@ def check_bit_rate(bit_rate: int) -> None:
         raise BenchError(f"bit rate {bit_rate} is not from 10000 to 1000000 bit/s")
 
 
+def check_data_bit_rate(data_bit_rate: int, bit_rate: int) -> None:
+    """Refuse a bit rate to which no CAN FD frame switches.
+
+    Raises
+    ------
+    BenchError
+        If it is below the nominal one or above 8 Mbit/s.
+    """
+    if not bit_rate <= data_bit_rate <= 8_000_000:
+        raise BenchError(
+            f"CAN FD data bit rate {data_bit_rate} is not from {bit_rate} (the bit rate) to 8000000 bit/s"
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigOptions:
     """What a bench is made of.
@@ -58,6 +73,8 @@ class RigOptions:
     bit_rate : int or None
         Bit/s; None is `DEFAULT_BIT_RATE` on a simulated wire, and on an adapter what python-can's
         configuration or the adapter itself says.
+    data_bit_rate : int
+        Bit/s at which a simulated wire carries CAN FD data; for bus load, what an adapter is taken to do.
     dbc : Path or None
         Another DBC than the packaged one.
     interface, channel : str or None
@@ -76,6 +93,7 @@ class RigOptions:
     machine: Machine = field(default_factory=Machine)
     tuning: ChosenTuning = field(default_factory=chosen_tuning)
     bit_rate: int | None = None
+    data_bit_rate: int = DEFAULT_DATA_BIT_RATE
     dbc: Path | None = None
     interface: str | None = None
     channel: str | None = None
@@ -87,6 +105,7 @@ class RigOptions:
 
     def __post_init__(self) -> None:
         check_bit_rate(self.wire_bit_rate if self.bit_rate is None else self.bit_rate)
+        check_data_bit_rate(self.data_bit_rate, self.wire_bit_rate)
 
     @property
     def wire_bit_rate(self) -> int:
@@ -128,7 +147,7 @@ class Recording:
     Attributes
     ----------
     traffic : ndarray of uint64, shape (frames, 4)
-        Bus time of each frame's end (ns), id, dlc, data.
+        Bus time of each frame's end (ns), id, dlc, data; see `hil.bus.wire.Wire.traffic`.
     supervisor, plant, controller : dict of ndarray, or None
         The nodes' records; None if the process did not live to write it, or is not ours.
     start_ns : int
@@ -139,6 +158,10 @@ class Recording:
         Empty if the scenario was played to its end, else what ended it.
     broken : bool
         Whether a process was lost.
+    payloads : ndarray of uint64, shape (CAN FD frames, 8)
+        What the rows of `traffic` have no room for.
+    data_bit_rate : int
+        Bit/s of CAN FD data.
     notes : dict
         What only some modes have: frames injected, drops, lateness.
     """
@@ -153,4 +176,6 @@ class Recording:
     startup_s: float
     ending: str = ""
     broken: bool = False
+    payloads: np.ndarray = field(default_factory=lambda: np.zeros((0, 8), np.uint64))
+    data_bit_rate: int = DEFAULT_DATA_BIT_RATE
     notes: dict[str, object] = field(default_factory=dict)

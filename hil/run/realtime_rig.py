@@ -110,7 +110,8 @@ class RealtimeRig(Rig):
     def _open(self, stack: ExitStack) -> None:
         settings = stack.enter_context(_bus_to_use(self.options))
         self.bus = stack.enter_context(open_bus(*settings))
-        self.listener = Listener(stack.enter_context(open_bus(*settings)))
+        fd = settings.interface == "hilbus"  # of other interfaces it may need an adapter for CAN FD
+        self.listener = Listener(stack.enter_context(open_bus(*settings, fd=fd)))
         self.processes = stack.enter_context(NodeProcesses(self.options, settings))
         stack.enter_context(self.listener.listening())
         self._wait_for_both_sides(self.options.start_timeout_s)
@@ -235,6 +236,8 @@ class RealtimeSession:
             startup_s=self._startup_s,
             ending=self.ending,
             broken=self.broken,
+            payloads=self._rig.listener.payloads,
+            data_bit_rate=options.data_bit_rate,
             notes={
                 "rt_ratio": float(options.rt_ratio),
                 "supervisor_lateness": self._runner.lateness.summary(),
@@ -288,6 +291,7 @@ def _bus_to_use(options: RigOptions) -> Iterator[BusSettings]:
     channel = options.channel or f"run-{os.getpid()}"
     bit_rate = options.wire_bit_rate
     command = [sys.executable, "-m", "hil", "bus", "--channel", channel, "--bitrate", str(bit_rate)]
+    command += ["--data-bitrate", str(options.data_bit_rate)]
     with subprocess.Popen(
         [*command, "--parent", str(os.getpid())],
         stdin=subprocess.DEVNULL,

@@ -56,3 +56,35 @@ def reference_bits(identifiers, extended, dlc, payloads):
     columns = [constant[0], *arbitration, *control, *length_code, *data]
     columns += bit_columns(crc15(columns), 15)
     return len(columns) + stuff_bits(columns) + 1 + 2 + 7 + 3
+
+
+def reference_fd_bits(identifiers, extended, switched, passive, payloads):
+    """Bits up to the switch and behind CRC, and bits between, of CAN FD frames of one kind and length.
+
+    `payloads` has a row of bytes for each frame.
+    """
+    zero, one = np.zeros_like(identifiers), np.ones_like(identifiers)
+    switch = one if switched else zero
+    if extended:
+        base, extension = identifiers >> np.uint64(18), identifiers & np.uint64(0x3FFFF)
+        nominal = [
+            zero,
+            *bit_columns(base, 11),
+            one,
+            one,
+            *bit_columns(extension, 18),
+            zero,
+            one,
+            zero,
+            switch,
+        ]
+    else:
+        nominal = [zero, *bit_columns(identifiers, 11), zero, zero, one, zero, switch]
+    length = payloads.shape[1]
+    code = bit_columns(np.full_like(identifiers, [*range(9), 12, 16, 20, 24, 32, 48, 64].index(length)), 4)
+    data = [column for byte in payloads.T for column in bit_columns(byte.astype(np.uint64), 8)]
+    stuffable = [*nominal, passive, *code, *data][:-1]  # what follows the last bit is the fixed stuff bit
+    crc_field = 4 + 17 + 6 if length <= 16 else 4 + 21 + 7
+    nominal_stuff_bits = stuff_bits(nominal)
+    fast_stuff_bits = stuff_bits(stuffable) - nominal_stuff_bits
+    return len(nominal) + nominal_stuff_bits + 12, 5 + 8 * length + fast_stuff_bits + crc_field + 1

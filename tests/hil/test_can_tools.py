@@ -45,8 +45,8 @@ def environment(live_directory, tmp_path, monkeypatch) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def open_bus(channel: str = "live") -> can.BusABC:
-    return can.Bus(interface="hilbus", channel=channel)
+def open_bus(channel: str = "live", fd: bool = False) -> can.BusABC:
+    return can.Bus(interface="hilbus", channel=channel, fd=fd)
 
 
 class Terminal:
@@ -88,16 +88,20 @@ class Terminal:
         return self._program.returncode
 
 
-def content(message: can.Message) -> tuple[int, bool, bytes]:
-    return message.arbitration_id, message.is_extended_id, bytes(message.data)
+Content = tuple[tuple[int, bool], tuple[bytes, bool, bool, bool]]
 
 
-def by_id(contents: list[tuple[int, bool, bytes]]) -> dict[tuple[int, bool], list[bytes]]:
-    """Return the payloads of each identifier in their order; between identifiers arbitration decides."""
-    payloads = defaultdict(list)
-    for can_id, extended, data in contents:
-        payloads[can_id, extended].append(data)
-    return payloads
+def content(message: can.Message) -> Content:
+    kind = message.is_fd, message.bitrate_switch, message.error_state_indicator
+    return (message.arbitration_id, message.is_extended_id), (bytes(message.data), *kind)
+
+
+def by_id(contents: list[Content]) -> dict[tuple[int, bool], list[tuple[bytes, bool, bool, bool]]]:
+    """Return what each identifier carried in its order; between identifiers arbitration decides."""
+    carried = defaultdict(list)
+    for can_id, rest in contents:
+        carried[can_id].append(rest)
+    return carried
 
 
 def send_until(bus: can.BusABC, happened, what: str, *messages: can.Message) -> None:
@@ -120,18 +124,30 @@ FRAMES = [
     for number, length in enumerate((0, 1, 3, 8))
     for can_id, extended in ((0x000, False), (0x123, False), (0x7FF, False), (0x1FFF_FFFF, True))
 ]
+FD_FRAMES = [
+    can.Message(
+        arbitration_id=0x456,
+        is_extended_id=False,
+        data=bytes(range(length)),
+        is_fd=True,
+        bitrate_switch=length % 8 == 0,
+        error_state_indicator=length == 64,
+    )
+    for length in can.util.CAN_FD_DLC
+]
 FILLER = can.Message(arbitration_id=0x700, is_extended_id=False, data=b"filler")
 
 
-def test_can_logger_logs_what_is_sent_and_can_player_replays_what_was_logged(tmp_path):
+@pytest.mark.parametrize(
+    ("options", "frames"), [((), FRAMES), (("--fd",), FRAMES + FD_FRAMES)], ids=["classic", "CAN FD"]
+)
+def test_can_logger_logs_what_is_sent_and_can_player_replays_what_was_logged(tmp_path, options, frames):
     log = tmp_path / "bus.log"
-    with (
-        background("can.logger", "-i", "hilbus", "-c", "live", "-f", str(log)) as logger,
-        open_bus() as sender,
-    ):
+    bus = ("-i", "hilbus", "-c", "live", *options)
+    with background("can.logger", *bus, "-f", str(log)) as logger, open_bus(fd=True) as sender:
         assert "hilbus channel 'live', 1000000 bit/s" in logger.stdout.readline()
         assert "Started" in logger.stdout.readline()
-        for message in FRAMES:
+        for message in frames:
             sender.send(message)
         send_until(
             sender, lambda: log.exists() and log.stat().st_size, "the log is written in part", *[FILLER] * 20
@@ -139,9 +155,9 @@ def test_can_logger_logs_what_is_sent_and_can_player_replays_what_was_logged(tmp
         logger.send_signal(signal.SIGINT)
         assert (logger.wait(SAFETY_NET_S), logger.stderr.read()) == (0, "")
     logged = [content(message) for message in can.LogReader(log)]
-    assert by_id([c for c in logged if c != content(FILLER)]) == by_id([content(m) for m in FRAMES])
+    assert by_id([c for c in logged if c != content(FILLER)]) == by_id([content(m) for m in frames])
 
-    with open_bus() as listener, background("can.player", "-i", "hilbus", "-c", "live", str(log)) as player:
+    with open_bus(fd=True) as listener, background("can.player", *bus, str(log)) as player:
         heard = [content(listener.recv(SAFETY_NET_S)) for _ in logged]
         assert (player.wait(SAFETY_NET_S), player.stderr.read()) == (0, "")
     assert by_id(heard) == by_id(logged)

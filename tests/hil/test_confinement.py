@@ -117,7 +117,7 @@ def test_an_error_frame_takes_bus_time():
     bus.wire.spoil(HIGH.can_id, FrameFault.DESTROY, 29, 1)
     bus.send(0, HIGH)
     bus.wire.run(10**6)
-    assert traffic_bits(bus.wire.traffic).tolist() == [30 + ERROR_BITS + IFS_BITS, HIGH_BITS]
+    assert traffic_bits(bus.wire.traffic).tolist() == [[30 + ERROR_BITS + IFS_BITS, 0], [HIGH_BITS, 0]]
 
 
 # error-passive, bus-off

@@ -3,12 +3,14 @@
 import can
 import numpy as np
 import pytest
-from bit_by_bit import bit_columns, crc15, reference_bits, stuff_bits
+from bit_by_bit import crc15, reference_bits, reference_fd_bits
+from can.util import CAN_FD_DLC
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbc.frame import EFF_FLAG
-from hil.bus.wire_time import RTR_FLAG, classic_bits, fd_bits, frame_bits
+from dbc.frame import BRS_FLAG, EFF_FLAG, ESI_FLAG
+from hil.bus.messages import to_frame
+from hil.bus.wire_time import RTR_FLAG, classic_bits, fd_bits, frame_bits, payload_words
 
 STANDARD_IDS = st.integers(0, (1 << 11) - 1)
 EXTENDED_IDS = st.integers(0, (1 << 29) - 1)
@@ -40,26 +42,34 @@ def test_classic_frame_length(frame, bits):
     assert frame_bits(frame) == bits
 
 
+def lengths_of(message):
+    """Bits at the nominal and at the data rate."""
+    can_id, length, data = to_frame(message)
+    return fd_bits(can_id, length, payload_words(data))
+
+
 @pytest.mark.parametrize(("length", "nominal", "fast"), [(8, 29, 97), (16, 29, 161), (64, 29, 550)])
 def test_fd_frame_length_per_bit_rate(length, nominal, fast):
     frame = message(0x555, b"\x55" * length, is_fd=True, bitrate_switch=True)
-    assert fd_bits(frame) == (nominal, fast)
+    assert lengths_of(frame) == (nominal, fast)
     assert frame_bits(frame) == nominal + fast
 
 
 def test_without_bit_rate_switch_an_fd_frame_is_nominal_throughout():
-    assert fd_bits(message(0x555, b"\x55" * 8, is_fd=True)) == (29 + 97, 0)
+    assert lengths_of(message(0x555, b"\x55" * 8, is_fd=True)) == (29 + 97, 0)
 
 
 def test_fd_payloads_are_filled_up_to_the_next_length():
-    assert fd_bits(message(0x555, b"\x55" * 9, is_fd=True)) == fd_bits(
-        message(0x555, b"\x55" * 9 + bytes(3), is_fd=True)
+    frame, filled_up = (
+        message(0x555, b"\x55" * 9 + fill, is_fd=True, bitrate_switch=True) for fill in (b"", bytes(3))
     )
+    assert lengths_of(frame) == lengths_of(filled_up)
+    assert frame_bits(frame) == frame_bits(filled_up)
 
 
 def test_five_equal_bits_at_the_end_of_fd_data_get_the_fixed_stuff_bit_only():
-    *_, without = fd_bits(message(0x555, b"\x55" * 7 + b"\x50", is_fd=True, bitrate_switch=True))
-    *_, ending_in_five = fd_bits(message(0x555, b"\x55" * 7 + b"\x60", is_fd=True, bitrate_switch=True))
+    *_, without = lengths_of(message(0x555, b"\x55" * 7 + b"\x50", is_fd=True, bitrate_switch=True))
+    *_, ending_in_five = lengths_of(message(0x555, b"\x55" * 7 + b"\x60", is_fd=True, bitrate_switch=True))
     assert ending_in_five == without
 
 
@@ -123,47 +133,74 @@ def test_random_frames_are_as_long_as_the_reference_says(dlc, extended):
     assert np.array_equal(bits, reference_bits(identifiers, extended, dlc, payloads))
 
 
-@given(
-    st.booleans().flatmap(
-        lambda extended: st.tuples(st.just(extended), EXTENDED_IDS if extended else STANDARD_IDS)
-    ),
-    st.sampled_from(sorted(can.util.CAN_FD_DLC)).flatmap(
-        lambda length: st.lists(
+FD_PAYLOADS = st.sampled_from(CAN_FD_DLC).flatmap(
+    lambda length: (
+        st.binary(min_size=length, max_size=length)
+        | st.lists(
             st.sampled_from([0x00, 0x1F, 0x55, 0x60, 0xF8, 0xFF]), min_size=length, max_size=length
-        )
-    ),
-    st.booleans(),
+        ).map(bytes)
+    )
 )
-def test_fd_frames_are_as_long_as_the_reference_says(identifier, data, error_passive):
-    extended, arbitration_id = identifier
+
+
+@given(STANDARD_IDS, EXTENDED_IDS, FD_PAYLOADS, st.booleans(), st.booleans(), st.booleans())
+def test_fd_frames_are_as_long_as_bit_strings_say(base, identifier, data, extended, passive, switched):
     frame = message(
-        arbitration_id,
-        bytes(data),
+        identifier if extended else base,
+        data,
         extended,
         is_fd=True,
-        bitrate_switch=True,
-        error_state_indicator=error_passive,
+        bitrate_switch=switched,
+        error_state_indicator=passive,
     )
-    assert fd_bits(frame) == reference_fd_bits(frame)
+    assert lengths_of(frame) == fd_bits_by_string(frame)
+    can_id, length, data = to_frame(frame)
+    assert fd_bits.py_func(can_id, length, payload_words(data)) == lengths_of(frame)
 
 
-def reference_fd_bits(frame):
-    """Nominal and fast bits, built from the fields of the standard."""
-    identifier = np.array([frame.arbitration_id], dtype=np.uint64)
-    zero, one = np.zeros_like(identifier), np.ones_like(identifier)
+@pytest.mark.parametrize("switched", [True, False], ids=["BRS", "no BRS"])
+@pytest.mark.parametrize("extended", [False, True], ids=["11 bit", "29 bit"])
+def test_random_fd_frames_are_as_long_as_the_reference_says(extended, switched):
+    """2 x 2 x 16 x 400 frames; half of the payloads are sparse or dense, so that many bits get stuffed."""
+    rng = np.random.default_rng(2 * extended + switched)
+    for length in CAN_FD_DLC:
+        identifiers = rng.integers(0, 1 << (29 if extended else 11), 400, dtype=np.uint64)
+        passive = rng.integers(0, 2, 400, dtype=np.uint64)
+        data = rng.integers(0, 256, (400, length), dtype=np.uint8)
+        mask = rng.integers(0, 256, (2, 400, length), dtype=np.uint8)
+        data[:100] &= mask[0, :100] & mask[1, :100]
+        data[100:200] |= mask[0, 100:200] | mask[1, 100:200]
+        nominal, fast = reference_fd_bits(identifiers, extended, switched, passive, data)
+        expected = np.column_stack([nominal, fast] if switched else [nominal + fast, 0 * fast])
+        flags = (EFF_FLAG if extended else 0) | (BRS_FLAG if switched else 0)
+        lengths = [
+            fd_bits(can_id | flags | esi * ESI_FLAG, length, payload_words(int.from_bytes(row, "little")))
+            for can_id, esi, row in zip(identifiers.tolist(), passive.tolist(), data, strict=True)
+        ]
+        assert np.array_equal(lengths, expected)
+
+
+def fd_bits_by_string(frame):
+    """Nominal and fast bits of one frame, from the characters of its fields (ISO 11898-1)."""
     if frame.is_extended_id:
-        base, extension = identifier >> np.uint64(18), identifier & np.uint64(0x3FFFF)
-        nominal = [zero, *bit_columns(base, 11), one, one, *bit_columns(extension, 18), zero, one, zero, one]
+        identifier = f"{frame.arbitration_id >> 18:011b}11{frame.arbitration_id & 0x3FFFF:018b}0"
     else:
-        nominal = [zero, *bit_columns(identifier, 11), zero, zero, one, zero, one]
-    esi = one if frame.error_state_indicator else zero
-    length_code = bit_columns(np.full_like(identifier, can.util.CAN_FD_DLC.index(len(frame.data))), 4)
-    data = [column for byte in frame.data for column in bit_columns(np.full_like(identifier, byte), 8)]
-    stuffable = [*nominal, esi, *length_code, *data[:-1]] if data else [*nominal, esi, *length_code[:-1]]
+        identifier = f"{frame.arbitration_id:011b}00"
+    before = f"0{identifier}10{frame.bitrate_switch:b}"
+    code = CAN_FD_DLC.index(len(frame.data))
+    after = f"{frame.error_state_indicator:b}{code:04b}" + "".join(f"{byte:08b}" for byte in frame.data)
+    stuffed = before + after
+    at, on_wire, run = 0, "", ""
+    switch = None
+    while at < len(stuffed):
+        on_wire += stuffed[at]
+        run = run + stuffed[at] if run.endswith(stuffed[at]) else stuffed[at]
+        at += 1
+        if len(run) == 5 and at < len(stuffed):
+            run = "0" if run[0] == "1" else "1"
+            on_wire += run
+        if at == len(before):
+            switch = len(on_wire)
     crc_field = 4 + 17 + 6 if len(frame.data) <= 16 else 4 + 21 + 7
-    nominal_stuff_bits = stuff_bits(nominal)[0]
-    fast_stuff_bits = stuff_bits(stuffable)[0] - nominal_stuff_bits
-    return (
-        len(nominal) + nominal_stuff_bits + 12,
-        5 + 8 * len(frame.data) + fast_stuff_bits + crc_field + 1,
-    )
+    nominal, fast = switch + 12, len(on_wire) - switch + crc_field + 1
+    return (nominal, fast) if frame.bitrate_switch else (nominal + fast, 0)

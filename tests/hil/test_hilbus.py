@@ -57,7 +57,8 @@ def stalled_hub() -> Iterator[tuple[can.BusABC, socket.socket]]:
     def greet() -> None:
         connection, _ = listener.accept()
         link.receive_json(connection)
-        link.send_json(connection, {"virtual": False, "bit_rate": 1_000_000})
+        rates = {"bit_rate": 1_000_000, "data_bit_rate": 5_000_000}
+        link.send_json(connection, {"virtual": False, **rates})
         accepted.append(connection)
 
     with link.seqpacket_socket() as listener:
@@ -399,7 +400,6 @@ def test_a_bus_can_be_named_in_the_environment(hub, no_configuration, monkeypatc
 @pytest.mark.parametrize(
     "refused",
     [
-        can.Message(arbitration_id=1, is_fd=True, data=b"\x00" * 12),
         can.Message(arbitration_id=1, is_remote_frame=True),
         can.Message(is_error_frame=True),
         can.Message(arbitration_id=0x800, is_extended_id=False),
@@ -409,11 +409,11 @@ def test_a_bus_can_be_named_in_the_environment(hub, no_configuration, monkeypatc
         can.Message(arbitration_id=1, data=b"\x00" * 9),
         can.Message(arbitration_id=1, data=b"\x01\x02", dlc=1),
     ],
-    ids=["FD", "remote", "error", "12-bit id", "30-bit id", "negative", "dlc 9", "9 bytes", "beyond dlc"],
+    ids=["remote", "error", "12-bit id", "30-bit id", "negative", "dlc 9", "9 bytes", "beyond dlc"],
 )
-def test_other_frames_than_classic_data_frames_are_refused_and_do_no_harm(hub, refused):
+def test_other_frames_than_data_frames_are_refused_and_do_no_harm(hub, refused):
     with open_bus() as sender, open_bus() as receiver:
-        with pytest.raises(can.CanOperationError, match=r"only classic data frames|no classic frame"):
+        with pytest.raises(can.CanOperationError, match=r"only data frames|no classic frame"):
             sender.send(refused)
         sender.send(message())
         assert receiver.recv(SAFETY_NET_S).arbitration_id == 0x123
@@ -444,22 +444,9 @@ def test_a_channel_name_that_cannot_be_a_socket_is_refused(channel):
             },
             "runs at 1000000 bit/s, not at 500000",
         ),
-        ({"fd": True}, "classic CAN only"),
-        (
-            {
-                "timing": can.BitTimingFd.from_sample_point(
-                    80_000_000,
-                    nom_bitrate=1_000_000,
-                    nom_sample_point=75.0,
-                    data_bitrate=8_000_000,
-                    data_sample_point=75.0,
-                )
-            },
-            "classic CAN only",
-        ),
         ({"receive_own_messages": True}, "a second bus on the channel"),
     ],
-    ids=["bit rate", "timing", "FD", "FD timing", "own messages"],
+    ids=["bit rate", "timing", "own messages"],
 )
 def test_what_the_bus_does_not_offer_is_refused_rather_than_ignored(hub, asked, what):
     with pytest.raises(can.CanInitializationError, match=what) as error:

@@ -194,7 +194,7 @@ def test_files_appear_only_when_all_are_there(tmp_path):
         (directory.scratch / "begun").write_text("x")
     assert list(tmp_path.iterdir()) == []
     with OutputDirectory(tmp_path, ".log") as directory:
-        assert {path.name for path in directory.write(run.result, run.trace, run.recording.traffic)} == FILES
+        assert {path.name for path in directory.write(run.result, run.trace, run.recording)} == FILES
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
