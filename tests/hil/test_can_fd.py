@@ -1,6 +1,7 @@
 """CAN FD frames that programs send: their time on the wire, who hears them, what is left of them."""
 
 import json
+import re
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
@@ -24,7 +25,7 @@ from hil.bus.messages import to_frame, to_message
 from hil.bus.wire import FrameFault, Wire
 from hil.bus.wire_core import MAX_PORTS
 from hil.bus.wire_time import traffic_bits
-from hil.bus_log import write_bus_log
+from hil.bus_log import check_log_format, write_bus_log
 from hil.run.inprocess import InprocessRig
 from hil.run.listener import Listener
 from hil.run.options import RigOptions
@@ -395,6 +396,28 @@ def test_payloads_that_all_have_read_are_forgotten(wire):
     assert [wire.logged(row)[1].data for row in range(len(wire.log))] == list(range(done - 1, 10))
 
 
+# the page about it
+
+PAGE = Path(__file__).parents[2] / "docs" / "bus.md"
+
+
+def test_the_page_s_example_runs_and_its_figures_are_right():
+    page = PAGE.read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    with serving("demo"), can.Bus(interface="hilbus", channel="demo", fd=True) as listener:
+        exec(example, {})
+        heard = listener.recv(SAFETY_NET_S)
+    assert (heard.arbitration_id, heard.is_fd, heard.bitrate_switch, len(heard.data)) == (
+        0x7F0,
+        True,
+        True,
+        64,
+    )
+    nominal, fast = reference_length(FD._replace(dlc=64, data=int.from_bytes(b"\x55" * 64, "little")))
+    assert f"64 bytes are {nominal} bits at the one and {fast} at the other" in " ".join(page.split())
+    assert f"by default {Wire(1_000_000).data_bit_rate // 10**6} Mbit/s" in " ".join(page.split())
+
+
 # command line
 
 
@@ -439,8 +462,9 @@ def logged(wire) -> Wire:
     return wire
 
 
-@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4"])
 def test_a_log_reads_back_frame_by_frame(logged, tmp_path, suffix):
+    check_log_format(suffix)
     path = tmp_path / f"bus{suffix}"
     assert write_bus_log(path, logged.traffic, logged.payloads) == 0
     with can.LogReader(path) as reader:
