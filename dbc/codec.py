@@ -97,7 +97,7 @@ class MessageCodec(Generic[P, T]):
 
         Returns
         -------
-        ndarray of int64, shape (dbc.e2e.CONFIGURATION_SIZE + fields,)
+        ndarray of int64, shape (dbc.profile2.CONFIGURATION_SIZE + fields,)
             The E2E configuration, then the start bit of each field.
         """
         return np.array([*self.receiver_configuration(), *(field.start for field in self.fields)], np.int64)

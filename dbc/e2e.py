@@ -10,34 +10,52 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
+from numba.extending import register_jitable
 
+from dbc import profile2
 from dbc.jit import entry_point, njit
+from dbc.profile2 import LOST_DATA, MAX_COUNTER, STATE_SIZE
+from dbc.restricted import register
 
-MAX_COUNTER = 15
+SOURCES = ("dbc.e2e", "dbc.machine", "dbc.profile2", "dbc.restricted")
+"""What code that is compiled with these functions depends on."""
+
+
+register(profile2)
 
 
 class Status(IntEnum):
     """Result of a check, with the values of ``E2E_P02CheckStatusType``."""
 
-    OK = 0x00
-    NONEWDATA = 0x01
-    WRONGCRC = 0x02
-    SYNC = 0x03
-    INITIAL = 0x04
-    REPEATED = 0x08
-    OKSOMELOST = 0x20
-    WRONGSEQUENCE = 0x40
+    OK = profile2.OK
+    NONEWDATA = profile2.NONEWDATA
+    WRONGCRC = profile2.WRONGCRC
+    SYNC = profile2.SYNC
+    INITIAL = profile2.INITIAL
+    REPEATED = profile2.REPEATED
+    OKSOMELOST = profile2.OKSOMELOST
+    WRONGSEQUENCE = profile2.WRONGSEQUENCE
 
 
 ACCEPTED = (int(Status.OK), int(Status.OKSOMELOST), int(Status.SYNC))
-"""Statuses whose data may be used (``E2E_P02MapStatusToSM`` with the R4.2 profile behaviour)."""
+"""Statuses whose data may be used."""
+
+_LOW_MASK = 0xFFFF_FFFF
 
 
-@njit("int64(uint64, int64, int64)")
+@register_jitable
+def _low(data):  # type: ignore[no-untyped-def]
+    return np.int64(data & np.uint64(_LOW_MASK))
+
+
+@register_jitable
+def _high(data):  # type: ignore[no-untyped-def]
+    return np.int64(data >> np.uint64(32))
+
+
+@njit("int64(uint64, int64, int64)", depends=SOURCES)
 def profile2_crc(data: int, dlc: int, data_id: int) -> int:
     """Return the profile-2 CRC of a payload (SWS_E2E_00133).
-
-    CRC-8 with polynomial 0x2F, initial value and final XOR 0xFF, over bytes 1 to `dlc` - 1 and the DataID.
 
     Parameters
     ----------
@@ -48,42 +66,10 @@ def profile2_crc(data: int, dlc: int, data_id: int) -> int:
     data_id : int
         DataID that belongs to the payload's counter, 0..255.
     """
-    crc = 0xFF
-    for position in range(1, dlc + 1):
-        byte = data_id if position == dlc else (data >> (8 * position)) & 0xFF
-        crc ^= byte
-        for _ in range(8):
-            crc = ((crc << 1) & 0xFF) ^ (0x2F if crc & 0x80 else 0)
-    return crc ^ 0xFF
+    return profile2.profile2_crc(_low(data), _high(data), dlc, data_id)
 
 
-# a receiver's configuration: 16 DataIDs, then
-DLC = 16  # payload length in bytes
-MAX_DELTA_COUNTER_INIT = 17
-MAX_NO_NEW_OR_REPEATED_DATA = 18
-SYNC_COUNTER_INIT = 19
-CONFIGURATION_SIZE = 20
-
-# a receiver's state, int64 words
-NOT_FIRST = 0  # whether there has been valid data
-LAST_VALID_COUNTER = 1
-MAX_DELTA_COUNTER = 2
-SYNC_COUNTER = 3
-NO_NEW_OR_REPEATED_DATA_COUNTER = 4
-LOST_DATA = 5
-STATE_SIZE = 6
-
-_OK = int(Status.OK)
-_NONEWDATA = int(Status.NONEWDATA)
-_WRONGCRC = int(Status.WRONGCRC)
-_SYNC = int(Status.SYNC)
-_INITIAL = int(Status.INITIAL)
-_REPEATED = int(Status.REPEATED)
-_OKSOMELOST = int(Status.OKSOMELOST)
-_WRONGSEQUENCE = int(Status.WRONGSEQUENCE)
-
-
-@njit("uint64(int64[::1], int64[::1], uint64)")
+@njit("uint64(int64[::1], int64[::1], uint64)", depends=SOURCES)
 def profile2_protect(counter, configuration, data):  # type: ignore[no-untyped-def]
     """``E2E_P02Protect``: return the payload with the next counter and the CRC filled in.
 
@@ -97,11 +83,11 @@ def profile2_protect(counter, configuration, data):  # type: ignore[no-untyped-d
         Payload as an unsigned integer, byte 0 in the low eight bits.
     """
     counter[0] = (counter[0] + 1) & MAX_COUNTER
-    payload = (data & ~np.uint64(0xFFF)) | np.uint64(counter[0] << 8)
-    return payload | np.uint64(profile2_crc(payload, configuration[DLC], configuration[counter[0]]))
+    low = profile2.profile2_protect(configuration, 0, counter[0], _low(data), _high(data))
+    return (data & ~np.uint64(_LOW_MASK)) | np.uint64(low)
 
 
-@njit("int64(int64[::1], int64[::1], uint64, int64)")
+@njit("int64(int64[::1], int64[::1], uint64, int64)", depends=SOURCES)
 def profile2_check(state, configuration, data, arrived):  # type: ignore[no-untyped-def]
     """``E2E_P02Check``: return the status of one received payload.
 
@@ -116,45 +102,7 @@ def profile2_check(state, configuration, data, arrived):  # type: ignore[no-unty
     arrived : int
         0 if nothing arrived since the last call; `data` is not looked at then.
     """
-    if state[MAX_DELTA_COUNTER] < MAX_COUNTER:
-        state[MAX_DELTA_COUNTER] += 1
-    if not arrived:
-        if state[NO_NEW_OR_REPEATED_DATA_COUNTER] < MAX_COUNTER:
-            state[NO_NEW_OR_REPEATED_DATA_COUNTER] += 1
-        return _NONEWDATA
-    counter = np.int64(data >> np.uint64(8)) & MAX_COUNTER
-    crc = profile2_crc(data, configuration[DLC], configuration[counter])
-    if crc != np.int64(data & np.uint64(0xFF)):
-        return _WRONGCRC
-    delta = (counter - state[LAST_VALID_COUNTER]) & MAX_COUNTER
-    if not state[NOT_FIRST]:
-        state[NOT_FIRST] = 1
-        status = _INITIAL
-    elif delta == 0:
-        if state[NO_NEW_OR_REPEATED_DATA_COUNTER] < MAX_COUNTER:
-            state[NO_NEW_OR_REPEATED_DATA_COUNTER] += 1
-        return _REPEATED
-    elif delta > state[MAX_DELTA_COUNTER]:  # SWS_E2E_00145: the counter jumped too far
-        state[NO_NEW_OR_REPEATED_DATA_COUNTER] = 0
-        state[SYNC_COUNTER] = configuration[SYNC_COUNTER_INIT]
-        if configuration[SYNC_COUNTER_INIT] == 0:
-            return _WRONGSEQUENCE
-        status = _WRONGSEQUENCE
-    else:  # SWS_E2E_00298, 00299: good once enough counters in a row were valid
-        stale = state[NO_NEW_OR_REPEATED_DATA_COUNTER] > configuration[MAX_NO_NEW_OR_REPEATED_DATA]
-        state[NO_NEW_OR_REPEATED_DATA_COUNTER] = 0
-        state[LOST_DATA] = delta - 1
-        if stale:
-            state[SYNC_COUNTER] = configuration[SYNC_COUNTER_INIT]
-            status = _SYNC
-        elif state[SYNC_COUNTER] > 0:
-            state[SYNC_COUNTER] -= 1
-            status = _SYNC
-        else:
-            status = _OK if delta == 1 else _OKSOMELOST
-    state[MAX_DELTA_COUNTER] = configuration[MAX_DELTA_COUNTER_INIT]
-    state[LAST_VALID_COUNTER] = counter
-    return status
+    return profile2.profile2_check(state, 0, configuration, 0, _low(data), _high(data), arrived)
 
 
 def receiver_configuration(

@@ -1,21 +1,18 @@
-"""Run the kernel's source, unmodified, on integers that check every operation at its width.
+"""Run the firmware's source, unmodified, on integers that check every operation at its width.
 
-`load` executes the kernel's modules with `i32` and `i64` making checked integers; `CheckedArray` stands for
+`load` executes the restricted modules with `i32` and `i64` making checked integers; `CheckedArray` stands for
 the flat int32 arrays. An overflow, an unnarrowed store or a zero divisor raises where it happens.
 """
 
 import importlib.util
 import operator
-import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from firmware_py import kernel
-from firmware_py.kernel import machine
-
-KERNEL = kernel.__name__
+from dbc import machine
+from firmware_py.kernel_check import MACHINE, module_names
 
 LOW32, HIGH32 = -(2**31), 2**31 - 1
 LOW64, HIGH64 = -(2**63), 2**63 - 1
@@ -90,7 +87,7 @@ def _negated(integer: type[int], width: int) -> Callable[[int], int]:
 
 def _forbidden(name: str) -> Callable[..., int]:
     def method(*operands: int) -> int:
-        raise TypeError(f"the kernel's integers have no {name}")
+        raise TypeError(f"the firmware's integers have no {name}")
 
     return method
 
@@ -100,6 +97,9 @@ def _install() -> None:
         ("add", "+", int.__add__, int.__radd__),
         ("sub", "-", int.__sub__, int.__rsub__),
         ("mul", "*", int.__mul__, int.__rmul__),
+        ("and", "&", int.__and__, int.__rand__),
+        ("or", "|", int.__or__, int.__ror__),
+        ("xor", "^", int.__xor__, int.__rxor__),
     ):
         for integer, checked in ((Int64, _checked64), (Int32, _checked32)):
             setattr(integer, f"__{name}__", checked(symbol, operation))
@@ -108,7 +108,7 @@ def _install() -> None:
         for name, symbol, operation in (("lshift", "<<", int.__lshift__), ("rshift", ">>", int.__rshift__)):
             setattr(integer, f"__{name}__", _shifted(symbol, operation, integer, width))
         integer.__neg__ = _negated(integer, width)  # type: ignore[method-assign]
-        for name in ("floordiv", "truediv", "mod", "pow", "divmod", "invert", "and", "or", "xor"):
+        for name in ("floordiv", "truediv", "mod", "pow", "divmod", "invert"):
             setattr(integer, f"__{name}__", _forbidden(name))
 
 
@@ -199,14 +199,15 @@ class CheckedArray(list[int]):
 
 
 def load() -> dict[str, ModuleType]:
-    """Execute the kernel on checked integers.
+    """Execute the firmware on checked integers.
 
     Returns
     -------
     dict of str to module
-        The kernel's modules by name, e.g. ``load()["control"].control_step``. They can import nothing
-        outside the kernel and see no builtins but those of `machine`'s declarations.
+        The modules by the last part of their names, ``load()["control"].control_step``. They can import
+        nothing but each other and see no builtins but those of `machine`'s declarations.
     """
+    names = module_names()
     modules: dict[str, ModuleType] = {}
 
     def load_module(name: str) -> ModuleType:
@@ -216,25 +217,32 @@ def load() -> dict[str, ModuleType]:
         if spec is None or spec.origin is None:
             raise ModuleNotFoundError(name)
         module = modules[name] = ModuleType(name)
-        module.__dict__["__builtins__"] = {"__import__": import_kernel, "range": range}
-        if name == f"{KERNEL}.machine":
+        module.__dict__["__builtins__"] = {"__import__": import_restricted, "range": range, "len": len}
+        if name == MACHINE:
             module.__dict__["__builtins__"] |= {"int": int, "memoryview": memoryview}
         exec(compile(Path(spec.origin).read_text(), spec.origin, "exec"), module.__dict__)
-        if name == f"{KERNEL}.machine":
+        if name == MACHINE:
             module.__dict__.update(i32=i32, i64=i64, low32=low32, clz=clz, div32=div32, div=div)
+        for table, value in list(module.__dict__.items()):
+            if type(value) is tuple:
+                module.__dict__[table] = _checked_table(value)
         return module
 
-    def import_kernel(
+    def import_restricted(
         name: str,
         globals: Mapping[str, Any] | None = None,
         locals: Mapping[str, Any] | None = None,
         fromlist: Sequence[str] | None = None,
         level: int = 0,
     ) -> ModuleType:
-        if not name.startswith(KERNEL + "."):
-            raise ImportError(f"the kernel imports only itself, not {name}")
+        if name not in names:
+            raise ImportError(f"the firmware imports only itself, not {name}")
         return load_module(name)
 
-    for info in pkgutil.iter_modules(kernel.__path__, KERNEL + "."):
-        load_module(info.name)
+    for name in names:
+        load_module(name)
     return {name.rpartition(".")[2]: module for name, module in modules.items()}
+
+
+def _checked_table(table: tuple[Any, ...]) -> Any:
+    return tuple(map(_checked_table, table)) if isinstance(table[0], tuple) else CheckedArray(table)

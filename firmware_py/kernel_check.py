@@ -1,29 +1,55 @@
-"""Check that the kernel stays in its restricted Python: ``python -m firmware_py.kernel_check``.
+"""Check that the firmware stays in its restricted Python: ``python -m firmware_py.kernel_check``.
 
-Widths are C's and are known without running anything: array elements and literals have 32 bits, annotations
-give those of parameters and results, a variable keeps the width of its first assignment. The subset is small
-enough to transpile: assignments, if, while, for over a constant range, calls, returns of one scalar.
+Widths are C's and are known without running anything: elements of arrays and tables have 32 bits, so have
+literals, annotations give those of parameters and results, a variable keeps the width of its first
+assignment. The subset is small enough to transpile: constants, tables, assignments, if, while, for over a
+constant range, calls, returns of one scalar.
 """
 
 import ast
 import importlib.util
+import operator
 import pkgutil
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from firmware_py import kernel
 
-KERNEL = kernel.__name__
-MACHINE = "machine"
+MACHINE = "dbc.machine"
 """The module that declares the machine words; the only one whose bodies are not in the subset."""
 
+MODULES = (
+    MACHINE,
+    "dbc.profile2",
+    "firmware_py.task_layout",
+    "firmware_py.signals",
+    "firmware_py.mailbox",
+    "firmware_py.state_machine",
+    "firmware_py.task",
+)
+"""What is in the subset, beside the control kernel."""
+
 Kind = int | str | None
-"""Width 32 or 64, "literal" (any width), "array", "bool", None for no value."""
+"""Width 32 or 64, "literal" (any width), "array", "table", "table of rows", "bool", None for no value."""
+
+Table = tuple[int, ...] | tuple[tuple[int, ...], ...]
 
 WIDTHS: dict[str, Kind] = {"int32": 32, "int64": 64, "Array32": "array", "None": None}
-ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.LShift, ast.RShift)
+OPERATIONS: dict[type[ast.operator], Callable[[int, int], int]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.LShift: operator.lshift,
+    ast.RShift: operator.rshift,
+    ast.BitAnd: operator.and_,
+    ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor,
+}
+BITWISE = (ast.BitAnd, ast.BitOr, ast.BitXor, ast.RShift)
+"""What leaves no width that its operands fit in."""
+
 ALLOCATIONS = (
     ast.List,
     ast.Dict,
@@ -48,11 +74,12 @@ class Signature:
 
 @dataclass(slots=True)
 class Module:
-    """What a kernel module defines."""
+    """What a module defines."""
 
     path: str
     tree: ast.Module
     constants: dict[str, int] = field(default_factory=dict)
+    tables: dict[str, Table] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
     kinds: dict[ast.expr, Kind] = field(default_factory=dict)
     """Kind of each expression and of each assigned name in the functions' bodies."""
@@ -65,24 +92,29 @@ class Violation(Exception):  # noqa: N818
         super().__init__(f"{getattr(node, 'lineno', 0)}: {message}")
 
 
-def kernel_sources() -> dict[str, tuple[str, str]]:
-    """Return path and source of each kernel module by its short name."""
+def module_names() -> tuple[str, ...]:
+    """Return the names of all modules that are in the subset."""
+    return (*MODULES, *(info.name for info in pkgutil.iter_modules(kernel.__path__, kernel.__name__ + ".")))
+
+
+def firmware_sources() -> dict[str, tuple[str, str]]:
+    """Return path and source of each module by its name."""
     sources = {}
-    for info in pkgutil.iter_modules(kernel.__path__, KERNEL + "."):
-        spec = importlib.util.find_spec(info.name)
+    for name in module_names():
+        spec = importlib.util.find_spec(name)
         assert spec is not None
         assert spec.origin is not None
-        sources[info.name.rpartition(".")[2]] = (spec.origin, Path(spec.origin).read_text(encoding="utf-8"))
+        sources[name] = (spec.origin, Path(spec.origin).read_text(encoding="utf-8"))
     return sources
 
 
 def check(sources: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Check kernel modules against each other.
+    """Check modules against each other.
 
     Parameters
     ----------
     sources : mapping of str to (str, str)
-        Path and source of each module by its short name.
+        Path and source of each module by its name.
 
     Returns
     -------
@@ -93,8 +125,10 @@ def check(sources: Mapping[str, tuple[str, str]]) -> list[str]:
 
 
 def analyse(sources: Mapping[str, tuple[str, str]]) -> tuple[dict[str, Module], list[str]]:
-    """Check kernel modules as `check` does; return also what is known of each by its short name."""
-    modules = {name: _declared(path, ast.parse(source)) for name, (path, source) in sources.items()}
+    """Check modules as `check` does; return also what is known of each by its name."""
+    modules: dict[str, Module] = {}
+    for name in sources:
+        _declare(name, sources, modules)
     violations = []
     for name, module in modules.items():
         for line in _ModuleChecker(module, modules).violations(bodies=name != MACHINE):
@@ -102,26 +136,65 @@ def analyse(sources: Mapping[str, tuple[str, str]]) -> tuple[dict[str, Module], 
     return modules, violations
 
 
-def _declared(path: str, tree: ast.Module) -> Module:
-    module = Module(path, tree)
+def _declare(name: str, sources: Mapping[str, tuple[str, str]], modules: dict[str, Module]) -> Module:
+    """Find out what a module defines, and first what those define that it imports."""
+    if name in modules:
+        return modules[name]
+    path, source = sources[name]
+    tree = ast.parse(source)
+    module = modules[name] = Module(path, tree)
+    known: dict[str, int] = {}
     for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module in sources:
+            known |= _declare(node.module, sources, modules).constants
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            value = _constant(node.value)
+            constant = node.targets[0].id
+            value = _constant(node.value, known)
             if value is not None:
-                module.constants[node.targets[0].id] = value
+                module.constants[constant] = known[constant] = value
+            table = _table(node.value, known)
+            if table is not None:
+                module.tables[constant] = table
         if isinstance(node, ast.FunctionDef):
             kinds = [_annotated(argument.annotation) for argument in node.args.args]
             module.functions[node.name] = Signature(tuple(kinds), _annotated(node.returns))
+    del modules[name]  # behind those it imports
+    modules[name] = module
     return module
 
 
-def _constant(node: ast.expr) -> int | None:
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        value = _constant(node.operand)
-        return None if value is None else -value
-    if isinstance(node, ast.Constant) and type(node.value) is int:
-        return node.value
+def _constant(node: ast.expr, known: Mapping[str, int]) -> int | None:
+    match node:
+        case ast.Constant() if type(node.value) is int:
+            return node.value
+        case ast.Name(id=name):
+            return known.get(name)
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            value = _constant(operand, known)
+            return None if value is None else -value
+        case ast.BinOp(left=left, op=operation, right=right) if type(operation) in OPERATIONS:
+            values = _constant(left, known), _constant(right, known)
+            if values[0] is None or values[1] is None:
+                return None
+            return OPERATIONS[type(operation)](values[0], values[1])
     return None
+
+
+def _table(node: ast.expr, known: Mapping[str, int]) -> Table | None:
+    """Return what a tuple of 32-bit constants holds, or one of equally long tuples of them."""
+    if not isinstance(node, ast.Tuple) or not node.elts:
+        return None
+    rows = [_row(element, known) for element in node.elts if isinstance(element, ast.Tuple)]
+    if not rows:
+        return _row(node, known)
+    whole = tuple(row for row in rows if row is not None)
+    return whole if len(whole) == len(node.elts) and len({len(row) for row in whole}) == 1 else None
+
+
+def _row(node: ast.Tuple, known: Mapping[str, int]) -> tuple[int, ...] | None:
+    values = tuple(_constant(element, known) for element in node.elts)
+    row = tuple(value for value in values if value is not None and _of_constant(value) != 64)
+    return row if row and len(row) == len(values) else None
 
 
 def _annotated(annotation: ast.expr | None) -> Kind:
@@ -138,6 +211,7 @@ class _ModuleChecker:
     module: Module
     modules: Mapping[str, Module]
     constants: dict[str, int] = field(default_factory=dict)
+    tables: dict[str, Table] = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
 
     def violations(self, *, bodies: bool) -> Iterator[str]:
@@ -157,30 +231,35 @@ class _ModuleChecker:
         if bodies:
             for node in self.module.tree.body:
                 if isinstance(node, ast.FunctionDef):
-                    checker = _FunctionChecker(self.constants, self.functions, self.module.kinds)
+                    checker = _FunctionChecker(self.constants, self.tables, self.functions, self.module.kinds)
                     yield from checker.violations(node)
 
     def _import(self, node: ast.ImportFrom) -> None:
-        package, _, name = (node.module or "").rpartition(".")
-        source = self.modules.get(name)
-        if package != KERNEL or source is None:
-            raise Violation(node, f"import from outside the kernel: {node.module}")
+        source = self.modules.get(node.module or "")
+        if source is None:
+            raise Violation(node, f"import from outside the subset: {node.module}")
         for alias in node.names:
             if alias.name in source.functions:
                 self.functions[alias.name] = source.functions[alias.name]
             elif alias.name in source.constants:
                 self.constants[alias.name] = source.constants[alias.name]
+            elif alias.name in source.tables:
+                self.tables[alias.name] = source.tables[alias.name]
             elif alias.name not in WIDTHS:
-                raise Violation(node, f"import of {alias.name}, which is no function or integer constant")
+                raise Violation(node, f"import of {alias.name}, which is no function, constant or table")
 
     def _constant(self, node: ast.stmt) -> None:
         if isinstance(node, ast.Import):
-            raise Violation(node, f"import from outside the kernel: {node.names[0].name}")
-        if not isinstance(node, ast.Assign) or _constant(node.value) is None:
-            raise Violation(node, "a module holds only imports, integer constants and functions")
-        for target in node.targets:
-            if isinstance(target, ast.Name):
-                self.constants[target.id] = self.module.constants[target.id]
+            raise Violation(node, f"import from outside the subset: {node.names[0].name}")
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            name = node.targets[0].id
+            if name in self.module.constants:
+                self.constants[name] = self.module.constants[name]
+                return
+            if name in self.module.tables:
+                self.tables[name] = self.module.tables[name]
+                return
+        raise Violation(node, "a module holds only imports, integer constants, tables and functions")
 
 
 def _is_docstring(node: ast.stmt) -> bool:
@@ -200,10 +279,12 @@ class _FunctionChecker:
     def __init__(
         self,
         constants: Mapping[str, int],
+        tables: Mapping[str, Table],
         functions: Mapping[str, Signature],
         kinds: dict[ast.expr, Kind],
     ) -> None:
         self.constants = constants
+        self.tables = tables
         self.functions = functions
         self.kinds = kinds
         self.variables: dict[str, Kind] = {}
@@ -235,8 +316,9 @@ class _FunctionChecker:
         match node:
             case ast.Assign(targets=[ast.Name() as target]):
                 self._assign(target, self._number(node.value))
-            case ast.Assign(targets=[ast.Subscript() as target]):
-                self._kind(target)
+            case ast.Assign(targets=[ast.Subscript(value=array) as target]):
+                if self._kind(target) != 32 or self._kind(array) != "array":
+                    raise Violation(node, f"not an array: {ast.unparse(array)}")
                 self._narrowed(node.value, "unnarrowed store")
             case ast.Return(value=None):
                 if self.result is not None:
@@ -295,8 +377,9 @@ class _FunctionChecker:
     def _narrowed(self, value: ast.expr, message: str) -> None:
         """Allow what is already 32 bits wide; a 32-bit sum or negation has to say `i32` or `sat32`."""
         kind = self._number(value)
-        is_arithmetic = isinstance(value, ast.BinOp | ast.UnaryOp) and _constant(value) is None
-        if kind not in (32, "literal") or is_arithmetic:
+        is_bitwise = isinstance(value, ast.BinOp) and isinstance(value.op, BITWISE)
+        is_arithmetic = isinstance(value, ast.BinOp | ast.UnaryOp) and _constant(value, {}) is None
+        if kind not in (32, "literal") or (is_arithmetic and not is_bitwise):
             raise Violation(value, f"{message}: {ast.unparse(value)}")
 
     def _number(self, node: ast.expr) -> Kind:
@@ -319,12 +402,12 @@ class _FunctionChecker:
                 return self.variables[name]
             case ast.Name(id=name) if name in self.constants:
                 return _of_constant(self.constants[name])
+            case ast.Name(id=name) if name in self.tables:
+                return "table" if isinstance(self.tables[name][0], int) else "table of rows"
             case ast.Name(id=name):
                 raise Violation(node, f"{name} is unknown here")
-            case ast.Subscript(value=ast.Name(id=name)) if self.variables.get(name) == "array":
-                if self._number(node.slice) == 64:
-                    raise Violation(node, "a 64-bit index")
-                return 32
+            case ast.Subscript(value=ast.Name() | ast.Subscript() as indexed):
+                return self._element(node, self._kind(indexed))
             case ast.BinOp():
                 return self._operation(node)
             case ast.UnaryOp(op=ast.USub()):
@@ -345,10 +428,17 @@ class _FunctionChecker:
             case _:
                 raise Violation(node, f"not in the subset: {type(node).__name__}")
 
+    def _element(self, node: ast.Subscript, indexed: Kind) -> Kind:
+        if indexed not in ("array", "table", "table of rows"):
+            raise Violation(node, f"not an array: {ast.unparse(node.value)}")
+        if self._number(node.slice) == 64:
+            raise Violation(node, "a 64-bit index")
+        return "table" if indexed == "table of rows" else 32
+
     def _operation(self, node: ast.BinOp) -> Kind:
         if isinstance(node.op, ast.Div | ast.FloorDiv | ast.Mod):
             raise Violation(node, f"division by an operator, use div: {ast.unparse(node)}")
-        if not isinstance(node.op, ARITHMETIC):
+        if type(node.op) not in OPERATIONS:
             raise Violation(node, f"not in the subset: {type(node.op).__name__}")
         left, right = self._number(node.left), self._number(node.right)
         if isinstance(node.op, ast.Mult) and (left, right) != (64, 64):
@@ -360,9 +450,12 @@ class _FunctionChecker:
     def _call(self, node: ast.Call) -> Kind:
         assert isinstance(node.func, ast.Name)
         name = node.func.id
+        match node:
+            case ast.Call(func=ast.Name(id="len"), args=[ast.Name(id=table)]) if table in self.tables:
+                return "literal"
         signature = self.functions.get(name)
         if signature is None:
-            raise Violation(node, f"call of {name}, which is no kernel function")
+            raise Violation(node, f"call of {name}, which is no function of the subset")
         if node.keywords or len(node.args) != len(signature.parameters):
             raise Violation(node, f"{name} takes {len(signature.parameters)} positional arguments")
         for argument, expected in zip(node.args, signature.parameters, strict=True):
@@ -375,7 +468,7 @@ class _FunctionChecker:
         return signature.result
 
     def _guarded(self, divisor: ast.expr) -> None:
-        constant = _constant(divisor)
+        constant = _constant(divisor, {})
         is_tested = isinstance(divisor, ast.Name) and divisor.id in self.positive
         if not is_tested and not (constant is not None and constant > 0):
             raise Violation(divisor, f"unguarded divisor, test it > 0 around div: {ast.unparse(divisor)}")
@@ -396,8 +489,8 @@ def _is_target(node: ast.AST) -> bool:
 
 
 def main() -> int:
-    """Check the kernel; print one line per violation."""
-    violations = check(kernel_sources())
+    """Check the firmware; print one line per violation."""
+    violations = check(firmware_sources())
     for violation in violations:
         print(violation)
     return 1 if violations else 0

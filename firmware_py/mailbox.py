@@ -1,121 +1,102 @@
 """Receive mailboxes: the newest frame of each id, its E2E check, its signals, how long it has been missing.
 
-A mailbox is a row of an int64 array that `receive` (receive interrupt) writes and `poll` (timer interrupt)
-reads; what it expects of its message is another row. Both functions are compiled.
+`receive` (receive interrupt) writes a mailbox, `poll` (timer interrupt) reads it. A mailbox begins at index
+`mailbox` of `mailboxes`, what is expected of its message at index `expected` of `contract`.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-from numba.extending import register_jitable
-
-from dbc import e2e
-from dbc.codec import MessageCodec
-from dbc.jit import njit
-from dbc.node import PERIOD_NS
-
-STALE_CYCLES = 3
-"""Cycles of a message without valid data after which it counts as lost."""
-
-MAX_FIELDS = 3
-
-# mailbox row: the receiver's E2E state, then
-ARRIVED = e2e.STATE_SIZE + 0  # frames since the last poll
-DATA = e2e.STATE_SIZE + 1  # payload of the newest, at most 63 bits
-LENGTH = e2e.STATE_SIZE + 2  # its number of bytes
-IS_NEW = e2e.STATE_SIZE + 3  # whether the last poll brought a valid frame
-AGE = e2e.STATE_SIZE + 4  # periods since the last valid frame
-STALE = e2e.STATE_SIZE + 5  # whether AGE has reached the limit
-CORRUPT = e2e.STATE_SIZE + 6  # whether the last frame failed its E2E check
-INVALID = e2e.STATE_SIZE + 7  # whether the last intact frame was not plausible
-OVERRUNS = e2e.STATE_SIZE + 8  # frames overwritten before they were read
-CANDIDATES = e2e.STATE_SIZE + 9  # signals of the newest intact frame
-VALUES = CANDIDATES + MAX_FIELDS  # signals of the newest valid frame
-MAILBOX_SIZE = VALUES + MAX_FIELDS
-
-# expectation row: the receiver's E2E configuration, then
-CYCLE_PERIODS = e2e.CONFIGURATION_SIZE + 0
-FIELD_COUNT = e2e.CONFIGURATION_SIZE + 1
-FIELDS = (
-    e2e.CONFIGURATION_SIZE + 2
-)  # of each field: start, length, sign bit, lowest and highest plausible value
-FIELD_SIZE = 5
-EXPECTATION_SIZE = FIELDS + MAX_FIELDS * FIELD_SIZE
-
-_FIRST = int(e2e.Status.INITIAL)
+from dbc.machine import Array32, i32, int32
+from dbc.profile2 import DLC, INITIAL, profile2_check, profile2_is_accepted
+from firmware_py.signals import extract
+from firmware_py.task_layout import (
+    AGE,
+    ARRIVED,
+    CANDIDATES,
+    CORRUPT,
+    COUNT_MAX,
+    CYCLE_PERIODS,
+    FIELD_COUNT,
+    FIELD_SIZE,
+    FIELDS,
+    HIGH,
+    INVALID,
+    IS_NEW,
+    LENGTH,
+    LOW,
+    MAILBOX_SIZE,
+    MAX_FIELDS,
+    OVERRUNS,
+    PHASE,
+    STALE,
+    STALE_PERIODS,
+    VALUES,
+)
 
 
-def expectation(message: MessageCodec[..., Any], plausible: Mapping[str, tuple[int, int]]) -> np.ndarray:
-    """Return the expectation row of a protected message.
-
-    Parameters
-    ----------
-    message : MessageCodec
-        The message; its cycle time sets the staleness limit.
-    plausible : mapping of str to (int, int)
-        Lowest and highest raw value of a field that may be used; of a field not named, all are.
-    """
-    row = np.zeros(EXPECTATION_SIZE, np.int64)
-    row[: e2e.CONFIGURATION_SIZE] = message.receiver_configuration()
-    row[CYCLE_PERIODS] = max(message.cycle_time_ns // PERIOD_NS, 1)
-    row[FIELD_COUNT] = len(message.fields)
-    for number, field in enumerate(message.fields):
-        low, high = plausible.get(field.name, (field.minimum, field.minimum + field.mask))
-        first = FIELDS + number * FIELD_SIZE
-        row[first : first + FIELD_SIZE] = field.start, field.length, -field.minimum, low, high
-    return row
+def clear(mailboxes: Array32, mailbox: int32, contract: Array32, expected: int32) -> None:
+    """Begin as at power-on: nothing received, stale."""
+    for word in range(MAILBOX_SIZE):
+        mailboxes[mailbox + word] = 0
+    mailboxes[mailbox + STALE] = 1
+    mailboxes[mailbox + AGE] = contract[expected + STALE_PERIODS]
 
 
-def empty(expectations: np.ndarray) -> np.ndarray:
-    """Return the mailboxes at power-on: nothing received, everything stale."""
-    mailboxes = np.zeros((len(expectations), MAILBOX_SIZE), np.int64)
-    mailboxes[:, STALE] = 1
-    mailboxes[:, AGE] = [STALE_CYCLES * row[CYCLE_PERIODS] for row in expectations]
-    return mailboxes
-
-
-@njit("void(int64[::1], uint64, int64)")
-def receive(mailbox, data, length):  # type: ignore[no-untyped-def]
+def take(mailboxes: Array32, mailbox: int32, length: int32, low: int32, high: int32) -> None:
     """Store a frame of `length` bytes; one that has not been read is overwritten, and counted."""
-    if mailbox[ARRIVED]:
-        mailbox[OVERRUNS] += 1
-    mailbox[ARRIVED] += 1
-    mailbox[DATA] = np.int64(data)
-    mailbox[LENGTH] = length
+    if mailboxes[mailbox + ARRIVED] != 0 and mailboxes[mailbox + OVERRUNS] < COUNT_MAX:
+        mailboxes[mailbox + OVERRUNS] = i32(mailboxes[mailbox + OVERRUNS] + 1)
+    mailboxes[mailbox + ARRIVED] = 1
+    mailboxes[mailbox + LOW] = low
+    mailboxes[mailbox + HIGH] = high
+    mailboxes[mailbox + LENGTH] = length
 
 
-@register_jitable
-def _take_values(mailbox, expected):  # type: ignore[no-untyped-def]
+def take_values(mailboxes: Array32, mailbox: int32, contract: Array32, expected: int32) -> None:
     """Extract the signals; use them only if all are plausible."""
-    values = mailbox[CANDIDATES:VALUES]
-    mailbox[INVALID] = 0
-    for number in range(expected[FIELD_COUNT]):
-        first = FIELDS + number * FIELD_SIZE
-        raw = (mailbox[DATA] >> expected[first]) & ((1 << expected[first + 1]) - 1)
-        value = (raw ^ expected[first + 2]) - expected[first + 2]
-        values[number] = value
-        if value < expected[first + 3] or value > expected[first + 4]:
-            mailbox[INVALID] = 1
-    if not mailbox[INVALID]:
-        mailbox[VALUES : VALUES + MAX_FIELDS] = values
-        mailbox[IS_NEW] = 1
-        mailbox[AGE] = 0
+    low = mailboxes[mailbox + LOW]
+    high = mailboxes[mailbox + HIGH]
+    mailboxes[mailbox + INVALID] = 0
+    field = expected + FIELDS
+    number = 0
+    while number < contract[expected + FIELD_COUNT]:
+        value = extract(low, high, contract[field], contract[field + 1], contract[field + 2])
+        mailboxes[mailbox + CANDIDATES + number] = value
+        if value < contract[field + 3] or value > contract[field + 4]:
+            mailboxes[mailbox + INVALID] = 1
+        field = field + FIELD_SIZE
+        number = number + 1
+    if mailboxes[mailbox + INVALID] == 0:
+        for word in range(MAX_FIELDS):
+            mailboxes[mailbox + VALUES + word] = mailboxes[mailbox + CANDIDATES + word]
+        mailboxes[mailbox + IS_NEW] = 1
+        mailboxes[mailbox + AGE] = 0
+        mailboxes[mailbox + PHASE] = 0
 
 
-@register_jitable
-def poll(mailbox, expected):  # type: ignore[no-untyped-def]
+def poll(mailboxes: Array32, mailbox: int32, contract: Array32, expected: int32) -> None:
     """Check what arrived since the last period. A frame of a wrong length is none to the E2E check."""
-    arrived = mailbox[ARRIVED] and mailbox[LENGTH] == expected[e2e.DLC]
-    mailbox[IS_NEW] = 0
-    mailbox[AGE] += 1
-    if mailbox[ARRIVED] or mailbox[AGE] % expected[CYCLE_PERIODS] == 0:
-        status = e2e.profile2_check(
-            mailbox[: e2e.STATE_SIZE], expected[: e2e.CONFIGURATION_SIZE], np.uint64(mailbox[DATA]), arrived
-        )
-        if mailbox[ARRIVED]:
-            mailbox[CORRUPT] = status not in e2e.ACCEPTED and status != _FIRST
-        if status in e2e.ACCEPTED:
-            _take_values(mailbox, expected)
-    mailbox[ARRIVED] = 0
-    mailbox[STALE] = mailbox[AGE] >= STALE_CYCLES * expected[CYCLE_PERIODS]
+    has_arrived = mailboxes[mailbox + ARRIVED]
+    is_frame = has_arrived
+    if mailboxes[mailbox + LENGTH] != contract[expected + DLC]:
+        is_frame = 0
+    mailboxes[mailbox + IS_NEW] = 0
+    if mailboxes[mailbox + AGE] < contract[expected + STALE_PERIODS]:
+        mailboxes[mailbox + AGE] = i32(mailboxes[mailbox + AGE] + 1)
+    phase = mailboxes[mailbox + PHASE] + 1
+    if phase >= contract[expected + CYCLE_PERIODS]:
+        phase = 0
+    mailboxes[mailbox + PHASE] = phase
+    if has_arrived != 0 or phase == 0:
+        low = mailboxes[mailbox + LOW]
+        high = mailboxes[mailbox + HIGH]
+        status = profile2_check(mailboxes, mailbox, contract, expected, low, high, is_frame)
+        is_accepted = profile2_is_accepted(status)
+        if has_arrived != 0:
+            mailboxes[mailbox + CORRUPT] = 1
+            if is_accepted != 0 or status == INITIAL:
+                mailboxes[mailbox + CORRUPT] = 0
+        if is_accepted != 0:
+            take_values(mailboxes, mailbox, contract, expected)
+    mailboxes[mailbox + ARRIVED] = 0
+    mailboxes[mailbox + STALE] = 0
+    if mailboxes[mailbox + AGE] >= contract[expected + STALE_PERIODS]:
+        mailboxes[mailbox + STALE] = 1

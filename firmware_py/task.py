@@ -1,254 +1,397 @@
-"""The control task: what one timer interrupt does with the mailboxes. Compiled; integers only."""
+"""The control task: what the receive and timer interrupts do.
 
-from enum import IntFlag
+`state`, `io` and `calibration` are the kernel's, see `firmware_py.kernel.layout`; for the other arrays see
+`firmware_py.task_layout`. A payload is two 32-bit words, byte 0 in the low eight bits of `low`.
+"""
 
-import numpy as np
-from numba.extending import register_jitable
-
-from dbc import e2e
-from dbc.jit import njit
-from firmware_py.compiled import control_reset, control_step
-from firmware_py.kernel import layout as k
-from firmware_py.mailbox import CORRUPT, INVALID, IS_NEW, OVERRUNS, STALE, VALUES, poll
+from dbc.machine import Array32, i32, int32
+from dbc.profile2 import MAX_COUNTER, profile2_protect
+from firmware_py.kernel.control import control_reset, control_step
+from firmware_py.kernel.layout import (
+    FLAG_SPEED_LIMITED,
+    IO_FLAGS,
+    IO_LAW,
+    IO_POSITION,
+    IO_SETPOINT,
+    IO_SIZE,
+    IO_TARGET_VELOCITY,
+    ST_SIZE,
+    ST_V1,
+)
+from firmware_py.mailbox import clear, poll, take
+from firmware_py.signals import begin, extract, insert
 from firmware_py.state_machine import (
     CALIBRATED,
     DRIVE_ENABLED,
     ENABLE,
     FAULT_RESET,
     INPUTS_FRESH,
-    NEXT_STATE,
     READY_TO_ENABLE,
-    State,
+    RUN,
+    SAFE,
+    STANDBY,
+    next_state,
 )
-
-# mailboxes
-(FEEDBACK, SETPOINT, COMMAND, DRIVE_STATUS) = range(4)
-
-# their signals
-FEEDBACK_POSITION = VALUES + 1
-SETPOINT_POSITION = VALUES
-COMMAND_ENABLE, COMMAND_LAW, COMMAND_FAULT_RESET = VALUES, VALUES + 1, VALUES + 2
-STATUSWORD = VALUES
-
-# task words
-(
-    STATE,
-    FAULTS,  # Fault bits: what is wrong now and any overrun since power-on; in the safe state what led there
-    IS_CALIBRATED,
+from firmware_py.task_layout import (
+    ARMED,
+    BENCH_COMMAND,
+    BENCH_CONTROL,
+    CALIBRATION_INVALID,
+    COMMAND,
+    COMMAND_CORRUPT,
+    COMMAND_COUNTER,
+    COMMAND_ENABLE,
+    COMMAND_FAULT_RESET,
+    COMMAND_LAW,
+    COMMAND_LOST,
+    CONTROLLER_STATUS,
+    CONTROLWORD,
+    CORRUPT,
+    COUNT_MAX,
+    CYCLE,
     DEFAULT_LAW,
-    ARMED,  # whether a command without Enable came since power-on or the last fault
-    RESET_ASKED,  # FaultReset of the last period
-    SATURATIONS,  # periods in which the drive's speed limited the command
-    COMMAND_COUNTER,  # E2E counter of DriveCommand
-    CONTROLWORD,  # out: CiA 402 controlword
-    VELOCITY,  # out: target velocity, 0.25 rpm
-) = range(10)
-TASK_SIZE = 10
-
-RECORD_COLUMNS = (
-    "time_ns",
-    "state",
-    "faults",
-    "setpoint_0p1um",
-    "position_um",
-    "target_velocity_0p25rpm",
-    "flags",
-    "v1",
-    "v2",
-    "v3",
-    "z1",
-    "z2",
-    "z3",
-    "z4",
-)
-_RECORD_KERNEL_STATE = RECORD_COLUMNS.index("v1")
-
-# where DriveCommand's layout says where its signals lie
-_CONTROLWORD_START = e2e.CONFIGURATION_SIZE
-_VELOCITY_START = e2e.CONFIGURATION_SIZE + 1
-
-COUNT_MAX = 0xFFFF
-
-
-class Fault(IntFlag):
-    """Fault bits, in the order of ControllerStatus."""
-
-    FEEDBACK_LOST = 1 << 0
-    FEEDBACK_CORRUPT = 1 << 1
-    FEEDBACK_INVALID = 1 << 2
-    SETPOINT_LOST = 1 << 3
-    SETPOINT_CORRUPT = 1 << 4
-    SETPOINT_INVALID = 1 << 5
-    COMMAND_LOST = 1 << 6
-    COMMAND_CORRUPT = 1 << 7
-    DRIVE_STATUS_LOST = 1 << 8
-    DRIVE_STATUS_CORRUPT = 1 << 9
-    DRIVE_NOT_ENABLED = 1 << 10
-    DRIVE_FAULT = 1 << 11
-    CALIBRATION_INVALID = 1 << 12
-    MAILBOX_OVERRUN = 1 << 13
-
-
-_MAILBOX_FAULTS = np.array(  # of each mailbox: lost, corrupt, invalid
-    [
-        (Fault.FEEDBACK_LOST, Fault.FEEDBACK_CORRUPT, Fault.FEEDBACK_INVALID),
-        (Fault.SETPOINT_LOST, Fault.SETPOINT_CORRUPT, Fault.SETPOINT_INVALID),
-        (Fault.COMMAND_LOST, Fault.COMMAND_CORRUPT, 0),
-        (Fault.DRIVE_STATUS_LOST, Fault.DRIVE_STATUS_CORRUPT, 0),
-    ],
-    np.int64,
-)
-_DRIVE_NOT_ENABLED = int(Fault.DRIVE_NOT_ENABLED)
-_DRIVE_FAULT = int(Fault.DRIVE_FAULT)
-_CALIBRATION_INVALID = int(Fault.CALIBRATION_INVALID)
-_MAILBOX_OVERRUN = int(Fault.MAILBOX_OVERRUN)
-
-_STANDBY, _RUN, _SAFE = int(State.STANDBY), int(State.RUN), int(State.SAFE)
-
-# CiA 402
-DISABLE_VOLTAGE, QUICK_STOP, SHUTDOWN, FAULT_RESET_BIT = 0x00, 0x02, 0x06, 0x80
-_STATE_MASK = 0x6F
-_OPERATION_ENABLED = 0x27
-_FAULT_BIT = 0x08  # set while the fault reaction is active too
-_FAULT_MASK, _IN_FAULT = 0x4F, 0x08
-_ENABLING = np.array(  # statusword mask and value, the controlword that leads on from there
-    [
-        (_STATE_MASK, _OPERATION_ENABLED, 0x0F),
-        (0x4F, 0x40, SHUTDOWN),  # switch on disabled
-        (_STATE_MASK, 0x21, 0x07),  # ready to switch on
-        (_STATE_MASK, 0x23, 0x0F),  # switched on
-        (_STATE_MASK, 0x07, QUICK_STOP),  # quick stop active: let it finish
-    ],
-    np.int64,
+    DRIVE_COMMAND,
+    DRIVE_FAULT,
+    DRIVE_NOT_ENABLED,
+    DRIVE_STATUS_CORRUPT,
+    DRIVE_STATUS_LOST,
+    EXECUTION_TIME,
+    EXPECTATION_SIZE,
+    EXPECTED_ID,
+    FAULT_COUNT,
+    FAULTS,
+    FEEDBACK_CORRUPT,
+    FEEDBACK_INVALID,
+    FEEDBACK_LOST,
+    FEEDBACK_POSITION,
+    FRAME_HIGH,
+    FRAME_LOW,
+    FRAME_SIZE,
+    INVALID,
+    IS_NEW,
+    MAILBOX_OVERRUN,
+    MAILBOX_SIZE,
+    MAILBOXES,
+    MESSAGE_ID,
+    OBSERVER_PAGE,
+    OBSERVER_PHASE,
+    OBSERVER_STATE,
+    OVERRUNS,
+    PROTECTION,
+    RESET_ASKED,
+    RESTART_ASKED,
+    SATURATIONS,
+    SENT_CONTROLWORD,
+    SENT_CYCLE,
+    SENT_EXECUTION_TIME,
+    SENT_FAULTS,
+    SENT_LAW,
+    SENT_OVERRUNS,
+    SENT_PAGE,
+    SENT_SATURATIONS,
+    SENT_STATE,
+    SENT_VALUE,
+    SENT_VELOCITY,
+    SETPOINT_CORRUPT,
+    SETPOINT_INVALID,
+    SETPOINT_LOST,
+    SETPOINT_POSITION,
+    SIGNAL_SIZE,
+    STALE,
+    STATE,
+    STATUS_PHASE,
+    STATUSWORD,
+    TASK_SIZE,
+    VELOCITY,
 )
 
+ASSUMED_EXECUTION_TIME = 20  # 0.5 %
+STATUS_PERIODS = 100
+OBSERVER_PERIODS = 10
+OBSERVER_DUE = 7  # its phase
+OBSERVER_PAGES = 7
+BENCH_RESET = 1  # BenchControl's command
 
-@register_jitable
-def _conditions(mailboxes, task):  # type: ignore[no-untyped-def]
-    enable = mailboxes[COMMAND, COMMAND_ENABLE]
-    reset_asked = mailboxes[COMMAND, COMMAND_FAULT_RESET]
-    reset_edge = reset_asked and not task[RESET_ASKED]
-    task[RESET_ASKED] = reset_asked
-    if task[STATE] != _STANDBY and task[STATE] != _RUN:
-        task[ARMED] = 0
-    elif mailboxes[COMMAND, IS_NEW] and not enable:
-        task[ARMED] = 1
+# faults of each mailbox
+IF_LOST = 0
+IF_CORRUPT = 1
+IF_INVALID = 2
+MAILBOX_FAULTS = (
+    (FEEDBACK_LOST, FEEDBACK_CORRUPT, FEEDBACK_INVALID),
+    (SETPOINT_LOST, SETPOINT_CORRUPT, SETPOINT_INVALID),
+    (COMMAND_LOST, COMMAND_CORRUPT, 0),
+    (DRIVE_STATUS_LOST, DRIVE_STATUS_CORRUPT, 0),
+)
+
+# CiA 402: controlwords, masks and values of the statusword
+DISABLE_VOLTAGE = 0x00
+QUICK_STOP = 0x02
+SHUTDOWN = 0x06
+SWITCH_ON = 0x07
+ENABLE_OPERATION = 0x0F
+RESET_FAULT = 0x80
+STATE_MASK = 0x6F
+OPERATION_ENABLED = 0x27
+FAULT_BIT = 0x08  # set while the fault reaction is active too
+FAULT_MASK = 0x4F
+IN_FAULT = 0x08
+
+# mask and value of the statusword, and the controlword that leads on from there
+MASK = 0
+VALUE = 1
+LEADS_ON = 2
+ENABLING = (
+    (STATE_MASK, OPERATION_ENABLED, ENABLE_OPERATION),
+    (0x4F, 0x40, SHUTDOWN),  # switch on disabled
+    (STATE_MASK, 0x21, SWITCH_ON),  # ready to switch on
+    (STATE_MASK, 0x23, ENABLE_OPERATION),  # switched on
+    (STATE_MASK, 0x07, QUICK_STOP),  # quick stop active: let it finish
+)
+
+
+def empty(contract: Array32, mailboxes: Array32) -> None:
+    """Empty all mailboxes."""
+    mailbox = 0
+    expected = 0
+    for _row in range(MAILBOXES):
+        clear(mailboxes, mailbox, contract, expected)
+        mailbox = mailbox + MAILBOX_SIZE
+        expected = expected + EXPECTATION_SIZE
+
+
+def restart(task: Array32, state: Array32, io: Array32) -> None:
+    """Begin as after power-on; what is known of calibration and execution time stays."""
+    law = task[DEFAULT_LAW]
+    execution_time = task[EXECUTION_TIME]
+    for word in range(TASK_SIZE):
+        task[word] = 0
+    for word in range(ST_SIZE):
+        state[word] = 0
+    for word in range(IO_SIZE):
+        io[word] = 0
+    task[DEFAULT_LAW] = law
+    task[EXECUTION_TIME] = execution_time
+
+
+def power_on(
+    contract: Array32, mailboxes: Array32, task: Array32, state: Array32, io: Array32, law: int32
+) -> None:
+    """Power-on with a calibration for `law`, 0 if there is no valid one."""
+    task[DEFAULT_LAW] = law
+    task[EXECUTION_TIME] = ASSUMED_EXECUTION_TIME
+    empty(contract, mailboxes)
+    restart(task, state, io)
+
+
+def receive(
+    contract: Array32,
+    mailboxes: Array32,
+    task: Array32,
+    can_id: int32,
+    length: int32,
+    low: int32,
+    high: int32,
+) -> None:
+    """Receive interrupt: latch. A reset forgets what came before it, not what comes after."""
+    mailbox = 0
+    expected = 0
+    for _row in range(MAILBOXES):
+        if can_id == contract[expected + EXPECTED_ID]:
+            take(mailboxes, mailbox, length, low, high)
+        mailbox = mailbox + MAILBOX_SIZE
+        expected = expected + EXPECTATION_SIZE
+    bit = contract[BENCH_COMMAND]
+    bits = contract[BENCH_COMMAND + 1]
+    if can_id == contract[BENCH_CONTROL + MESSAGE_ID] and extract(low, high, bit, bits, 0) == BENCH_RESET:
+        empty(contract, mailboxes)
+        task[RESTART_ASKED] = 1
+
+
+def conditions_of(mailboxes: Array32, task: Array32) -> int32:
+    """Conditions of the state machine; moves `task`'s ARMED and RESET_ASKED on."""
+    enable = mailboxes[COMMAND_ENABLE]
+    reset_asked = mailboxes[COMMAND_FAULT_RESET]
     conditions = 0
-    if task[IS_CALIBRATED]:
-        conditions |= CALIBRATED
-    if not mailboxes[:, STALE].any():
-        conditions |= INPUTS_FRESH
-    if enable and task[ARMED]:
-        conditions |= ENABLE
-    if mailboxes[DRIVE_STATUS, STATUSWORD] & _STATE_MASK == _OPERATION_ENABLED:
-        conditions |= DRIVE_ENABLED
-    if reset_edge:
-        conditions |= FAULT_RESET
+    if reset_asked != 0 and task[RESET_ASKED] == 0:
+        conditions = conditions | FAULT_RESET
+    task[RESET_ASKED] = reset_asked
+    if task[STATE] != STANDBY and task[STATE] != RUN:
+        task[ARMED] = 0
+    elif mailboxes[COMMAND + IS_NEW] != 0 and enable == 0:
+        task[ARMED] = 1
+    if task[DEFAULT_LAW] != 0:
+        conditions = conditions | CALIBRATED
+    stale = 0
+    mailbox = 0
+    for _row in range(MAILBOXES):
+        stale = stale | mailboxes[mailbox + STALE]
+        mailbox = mailbox + MAILBOX_SIZE
+    if stale == 0:
+        conditions = conditions | INPUTS_FRESH
+    if enable != 0 and task[ARMED] != 0:
+        conditions = conditions | ENABLE
+    if (mailboxes[STATUSWORD] & STATE_MASK) == OPERATION_ENABLED:
+        conditions = conditions | DRIVE_ENABLED
     return conditions
 
 
-@register_jitable
-def _faults(mailboxes, task, before):  # type: ignore[no-untyped-def]
+def faults_of(mailboxes: Array32, task: Array32, before: int32) -> int32:
+    """Fault bits; `before` is the state of the last period."""
     faults = 0
-    for row in range(mailboxes.shape[0]):
-        if mailboxes[row, STALE]:
-            faults |= _MAILBOX_FAULTS[row, 0]
-            if mailboxes[row, CORRUPT]:
-                faults |= _MAILBOX_FAULTS[row, 1]
-            if mailboxes[row, INVALID]:
-                faults |= _MAILBOX_FAULTS[row, 2]
-        if mailboxes[row, OVERRUNS]:
-            faults |= _MAILBOX_OVERRUN
-    if not task[IS_CALIBRATED]:
-        faults |= _CALIBRATION_INVALID
-    statusword = mailboxes[DRIVE_STATUS, STATUSWORD]
-    if statusword & _FAULT_BIT:
-        faults |= _DRIVE_FAULT
-    if task[STATE] == _SAFE:
-        if before == _RUN and statusword & _STATE_MASK != _OPERATION_ENABLED:
-            faults |= _DRIVE_NOT_ENABLED
-        faults |= task[FAULTS]
+    mailbox = 0
+    for row in range(MAILBOXES):
+        if mailboxes[mailbox + STALE] != 0:
+            faults = faults | MAILBOX_FAULTS[row][IF_LOST]
+            if mailboxes[mailbox + CORRUPT] != 0:
+                faults = faults | MAILBOX_FAULTS[row][IF_CORRUPT]
+            if mailboxes[mailbox + INVALID] != 0:
+                faults = faults | MAILBOX_FAULTS[row][IF_INVALID]
+        if mailboxes[mailbox + OVERRUNS] != 0:
+            faults = faults | MAILBOX_OVERRUN
+        mailbox = mailbox + MAILBOX_SIZE
+    if task[DEFAULT_LAW] == 0:
+        faults = faults | CALIBRATION_INVALID
+    statusword = mailboxes[STATUSWORD]
+    if (statusword & FAULT_BIT) != 0:
+        faults = faults | DRIVE_FAULT
+    if task[STATE] == SAFE:
+        if before == RUN and (statusword & STATE_MASK) != OPERATION_ENABLED:
+            faults = faults | DRIVE_NOT_ENABLED
+        faults = faults | task[FAULTS]
     return faults
 
 
-@register_jitable
-def _control(mailboxes, task, calibration, state, io, entered):  # type: ignore[no-untyped-def]
-    io[k.IO_SETPOINT] = mailboxes[SETPOINT, SETPOINT_POSITION]
-    io[k.IO_POSITION] = mailboxes[FEEDBACK, FEEDBACK_POSITION]
-    if entered:
-        law = mailboxes[COMMAND, COMMAND_LAW]
-        io[k.IO_LAW] = law if law else task[DEFAULT_LAW]
+def control(
+    mailboxes: Array32, task: Array32, calibration: Array32, state: Array32, io: Array32, has_entered: int32
+) -> None:
+    """One step of the control law; a reset of it before, where the task `has_entered` the run state."""
+    io[IO_SETPOINT] = mailboxes[SETPOINT_POSITION]
+    io[IO_POSITION] = mailboxes[FEEDBACK_POSITION]
+    if has_entered != 0:
+        io[IO_LAW] = mailboxes[COMMAND_LAW]
+        if io[IO_LAW] == 0:
+            io[IO_LAW] = task[DEFAULT_LAW]
         control_reset(calibration, state, io)
     control_step(calibration, state, io)
-    task[VELOCITY] = io[k.IO_TARGET_VELOCITY]
-    if io[k.IO_FLAGS] & k.FLAG_SPEED_LIMITED and task[SATURATIONS] < COUNT_MAX:
-        task[SATURATIONS] += 1
+    task[VELOCITY] = io[IO_TARGET_VELOCITY]
+    if (io[IO_FLAGS] & FLAG_SPEED_LIMITED) != 0 and task[SATURATIONS] < COUNT_MAX:
+        task[SATURATIONS] = i32(task[SATURATIONS] + 1)
 
 
-@register_jitable
-def _controlword(statusword, task, conditions):  # type: ignore[no-untyped-def]
-    if task[STATE] == _SAFE:
+def controlword_for(statusword: int32, task: Array32, conditions: int32) -> int32:
+    """Controlword that answers the drive's statusword."""
+    if task[STATE] == SAFE:
         return QUICK_STOP
     if statusword == 0:  # the drive has not been heard of
         return DISABLE_VOLTAGE
-    if statusword & _FAULT_MASK == _IN_FAULT:
-        return FAULT_RESET_BIT if task[RESET_ASKED] else DISABLE_VOLTAGE
-    if task[STATE] != _RUN and conditions & READY_TO_ENABLE != READY_TO_ENABLE:
+    if (statusword & FAULT_MASK) == IN_FAULT:
+        if task[RESET_ASKED] != 0:
+            return RESET_FAULT
+        return DISABLE_VOLTAGE
+    if task[STATE] != RUN and (conditions & READY_TO_ENABLE) != READY_TO_ENABLE:
         return SHUTDOWN
-    for row in range(_ENABLING.shape[0]):
-        if statusword & _ENABLING[row, 0] == _ENABLING[row, 1]:
-            return _ENABLING[row, 2]
+    for row in range(len(ENABLING)):
+        if (statusword & ENABLING[row][MASK]) == ENABLING[row][VALUE]:
+            return ENABLING[row][LEADS_ON]
     return DISABLE_VOLTAGE
 
 
-@njit(
-    "uint64(int64[:,::1], int64[:,::1], int64[::1], int64[::1], int32[::1], int32[::1], int32[::1],"
-    " int64[::1], int64)",
-    depends=(
-        "dbc.e2e",
-        "firmware_py.compiled",
-        "firmware_py.kernel",
-        "firmware_py.mailbox",
-        "firmware_py.state_machine",
-    ),
-)
-def period(mailboxes, expectations, layout, task, calibration, state, io, record, now_ns):  # type: ignore[no-untyped-def]
-    """Run one control period; return the protected payload of DriveCommand.
+def send_command(contract: Array32, task: Array32, frames: Array32) -> None:
+    """DriveCommand, the first frame."""
+    counter = (task[COMMAND_COUNTER] + 1) & MAX_COUNTER
+    begin(frames, 0, contract, DRIVE_COMMAND)
+    insert(frames, 0, contract, SENT_CONTROLWORD, task[CONTROLWORD])
+    insert(frames, 0, contract, SENT_VELOCITY, task[VELOCITY])
+    frames[FRAME_LOW] = profile2_protect(contract, PROTECTION, counter, frames[FRAME_LOW], frames[FRAME_HIGH])
+    task[COMMAND_COUNTER] = counter
 
-    Parameters
-    ----------
-    mailboxes, expectations : array of int64, a row for each mailbox
-        See `firmware_py.mailbox`.
-    layout : array of int64
-        DriveCommand's, from `dbc.codec.MessageCodec.protected_layout`.
-    task : array of int64, shape (TASK_SIZE,)
-        State of the task, updated in place.
-    calibration, state, io : array of int32
-        The kernel's.
-    record : array of int64, shape (len(RECORD_COLUMNS),)
-        Filled with this period's row.
-    now_ns : int
-        For the record.
-    """
-    for row in range(mailboxes.shape[0]):
-        poll(mailboxes[row], expectations[row])
-    conditions = _conditions(mailboxes, task)
+
+def send_status(
+    contract: Array32, mailboxes: Array32, task: Array32, io: Array32, frames: Array32, frame: int32
+) -> None:
+    """ControllerStatus."""
+    law = io[IO_LAW]
+    if law == 0:
+        law = task[DEFAULT_LAW]
+    overruns = 0
+    mailbox = 0
+    for _row in range(MAILBOXES):
+        overruns = overruns + mailboxes[mailbox + OVERRUNS]
+        mailbox = mailbox + MAILBOX_SIZE
+    if overruns > COUNT_MAX:
+        overruns = COUNT_MAX
+    begin(frames, frame, contract, CONTROLLER_STATUS)
+    insert(frames, frame, contract, SENT_STATE, task[STATE])
+    insert(frames, frame, contract, SENT_LAW, law)
+    signal = SENT_FAULTS
+    for fault in range(FAULT_COUNT):
+        insert(frames, frame, contract, signal, task[FAULTS] >> fault)
+        signal = signal + SIGNAL_SIZE
+    insert(frames, frame, contract, SENT_EXECUTION_TIME, task[EXECUTION_TIME])
+    insert(frames, frame, contract, SENT_SATURATIONS, task[SATURATIONS])
+    insert(frames, frame, contract, SENT_OVERRUNS, overruns)
+
+
+def send_observer(contract: Array32, task: Array32, state: Array32, frames: Array32, frame: int32) -> None:
+    """ObserverState: one of its pages after the other."""
+    begin(frames, frame, contract, OBSERVER_STATE)
+    insert(frames, frame, contract, SENT_PAGE, task[OBSERVER_PAGE])
+    insert(frames, frame, contract, SENT_CYCLE, task[CYCLE])
+    insert(frames, frame, contract, SENT_VALUE, state[ST_V1 + task[OBSERVER_PAGE]])
+
+
+def count_period(task: Array32) -> None:
+    """Move on to the next period."""
+    task[CYCLE] = (task[CYCLE] + 1) & 0xFFFF
+    task[STATUS_PHASE] = i32(task[STATUS_PHASE] + 1)
+    if task[STATUS_PHASE] == STATUS_PERIODS:
+        task[STATUS_PHASE] = 0
+    task[OBSERVER_PHASE] = i32(task[OBSERVER_PHASE] + 1)
+    if task[OBSERVER_PHASE] == OBSERVER_PERIODS:
+        task[OBSERVER_PHASE] = 0
+        task[OBSERVER_PAGE] = i32(task[OBSERVER_PAGE] + 1)
+        if task[OBSERVER_PAGE] == OBSERVER_PAGES:
+            task[OBSERVER_PAGE] = 0
+
+
+def period(
+    contract: Array32,
+    mailboxes: Array32,
+    task: Array32,
+    calibration: Array32,
+    state: Array32,
+    io: Array32,
+    frames: Array32,
+) -> int32:
+    """Timer interrupt: one control period. The result is how many of `frames` are to be sent."""
+    if task[RESTART_ASKED] != 0:
+        restart(task, state, io)
+    mailbox = 0
+    expected = 0
+    for _row in range(MAILBOXES):
+        poll(mailboxes, mailbox, contract, expected)
+        mailbox = mailbox + MAILBOX_SIZE
+        expected = expected + EXPECTATION_SIZE
+    conditions = conditions_of(mailboxes, task)
     before = task[STATE]
-    task[STATE] = NEXT_STATE[before, conditions]
-    task[FAULTS] = _faults(mailboxes, task, before)
+    task[STATE] = next_state(before, conditions)
+    task[FAULTS] = faults_of(mailboxes, task, before)
     task[VELOCITY] = 0
-    if task[STATE] == _RUN:
-        _control(mailboxes, task, calibration, state, io, before != _RUN)
-    task[CONTROLWORD] = _controlword(mailboxes[DRIVE_STATUS, STATUSWORD], task, conditions)
-    record[0] = now_ns
-    record[1] = task[STATE]
-    record[2] = task[FAULTS]
-    record[3] = io[k.IO_SETPOINT]
-    record[4] = io[k.IO_POSITION]
-    record[5] = task[VELOCITY]
-    record[6] = io[k.IO_FLAGS]
-    record[_RECORD_KERNEL_STATE:] = state[k.ST_V1 : k.ST_Z4 + 1]
-    payload = task[CONTROLWORD] << layout[_CONTROLWORD_START]
-    payload |= (task[VELOCITY] & 0xFFFF) << layout[_VELOCITY_START]
-    counter = task[COMMAND_COUNTER : COMMAND_COUNTER + 1]
-    return e2e.profile2_protect(counter, layout[: e2e.CONFIGURATION_SIZE], np.uint64(payload))
+    if task[STATE] == RUN:
+        has_entered = 0
+        if before != RUN:
+            has_entered = 1
+        control(mailboxes, task, calibration, state, io, has_entered)
+    task[CONTROLWORD] = controlword_for(mailboxes[STATUSWORD], task, conditions)
+    send_command(contract, task, frames)
+    frame = FRAME_SIZE
+    count = 1
+    if task[STATUS_PHASE] == 0:
+        send_status(contract, mailboxes, task, io, frames, frame)
+        frame = frame + FRAME_SIZE
+        count = count + 1
+    if task[OBSERVER_PHASE] == OBSERVER_DUE:
+        send_observer(contract, task, state, frames, frame)
+        count = count + 1
+    count_period(task)
+    return count

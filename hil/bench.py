@@ -9,8 +9,8 @@ import numpy as np
 from dbc.codec import signal_name
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
-from firmware_py.state_machine import State as ControllerState
-from firmware_py.task import Fault
+from firmware_py.diagnosis import Fault
+from firmware_py.diagnosis import State as ControllerState
 from hil.bus.wire import ErrorState
 from hil.faults.catalogue import fault_of
 from hil.faults.fault import Fault as InjectedFault

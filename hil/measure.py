@@ -10,9 +10,8 @@ import numpy as np
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
+from firmware_py.diagnosis import Fault, State
 from firmware_py.node import PHASE_NS
-from firmware_py.state_machine import State
-from firmware_py.task import Fault
 from hil.bus.wire_time import traffic_bits
 from hil.faults.fault import Fault as InjectedFault
 from hil.run.options import Recording, RigOptions, RunOptions

@@ -6,8 +6,9 @@ from dbc import e2e
 from dbc.jit import njit
 from dbc.node import PERIOD_NS
 from dbc.packet import KIND, NOT_ANSWERED, TIME, TIMER
+from dbc.profile2 import CONFIGURATION_SIZE
 
-_POSITION_START = e2e.CONFIGURATION_SIZE
+_POSITION_START = CONFIGURATION_SIZE
 _POSITION_MASK = 0xFFFF_FFFF
 
 
@@ -59,5 +60,5 @@ def answer_setpoint(  # type: ignore[no-untyped-def]
     answered[0] = due_ns + PERIOD_NS
     answered[1] = due_ns
     answered[2] = head
-    answered[3] = np.int64(e2e.profile2_protect(counter, layout[: e2e.CONFIGURATION_SIZE], payload))
+    answered[3] = np.int64(e2e.profile2_protect(counter, layout[:CONFIGURATION_SIZE], payload))
     return 32

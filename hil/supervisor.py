@@ -15,6 +15,7 @@ from dbc.jit import entry_point
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.packet import HEAD_DLC, NOT_ANSWERED, answer_by_entry_points
+from dbc.profile2 import CONFIGURATION_SIZE
 from dbc.record import Record
 from hil.references import setpoint_counts
 from hil.scenario import CONTROLLERS, PERIOD_S, Scenario, law_of
@@ -84,7 +85,7 @@ class Supervisor:
         self._bench_control = contract.bench_control
         self._bench_load = contract.bench_load
         counter, layout = np.zeros(1, np.int64), self._setpoint.protected_layout()
-        self._protect_setpoint = partial(_protect, counter, layout[: e2e.CONFIGURATION_SIZE])
+        self._protect_setpoint = partial(_protect, counter, layout[:CONFIGURATION_SIZE])
         setpoint_head = self._setpoint.can_id | self._setpoint.dlc << HEAD_DLC
         self._answer_setpoint = partial(_answer_setpoint, setpoint_head, layout, counter)
         self._protect_command = self._command.protector().protect

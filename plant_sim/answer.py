@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from dbc import e2e
 from dbc.jit import njit
 from dbc.node import PERIOD_NS
 from dbc.packet import FRAME_WORDS, FRAMES, HEAD_DLC, ID_MASK, KIND, NOT_ANSWERED, TIME, TIMER
+from dbc.profile2 import DLC
 from plant_sim import period
 from plant_sim.period import run_period
 
@@ -74,7 +74,7 @@ def answer_timer(  # type: ignore[no-untyped-def]
         sensor,
         periods,
         np.uint64(data),
-        length == command[e2e.DLC],
+        length == command[DLC],
         0.0,
     )
     rows[count[0]] = row

@@ -5,13 +5,13 @@ from functools import partial
 
 import numpy as np
 
-from dbc import e2e
 from dbc.contract import Contract
 from dbc.frame import Frame
 from dbc.jit import entry_point
 from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.packet import HEAD_DLC, NOT_ANSWERED, answer_by_entry_points, append_frame, event_ns
+from dbc.profile2 import STATE_SIZE
 from dbc.record import Record
 from plant_sim.answer import answer_timer
 from plant_sim.drive import COUNTS_PER_RPM, Drive
@@ -101,7 +101,7 @@ class Plant:
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: at rest, retracted, drive off."""
-        self._receiver = np.zeros(e2e.STATE_SIZE, np.int64)
+        self._receiver = np.zeros(STATE_SIZE, np.int64)
         self._feedback_counter = np.zeros(1, np.int64)
         self._protect_status = self._contract.drive_status.protector().protect
         self._command_frame: Frame | None = None

@@ -5,6 +5,7 @@ import numpy as np
 from dbc import e2e
 from dbc.jit import njit
 from dbc.node import PERIOD_NS
+from dbc.profile2 import CONFIGURATION_SIZE
 from plant_sim import layout as at
 from plant_sim.drive import STATE, drive_step
 from plant_sim.hydraulics import accumulator_pressure
@@ -41,14 +42,14 @@ COLUMNS = (
 """Indices of a row: the state at its period's start, and what acts during it."""
 
 # where the layouts of DriveCommand and PositionFeedback say where their signals lie
-_CONTROLWORD_START, _TARGET_START = e2e.CONFIGURATION_SIZE, e2e.CONFIGURATION_SIZE + 1
-_SENSOR_STATUS_START, _POSITION_START = e2e.CONFIGURATION_SIZE, e2e.CONFIGURATION_SIZE + 1
+_CONTROLWORD_START, _TARGET_START = CONFIGURATION_SIZE, CONFIGURATION_SIZE + 1
+_SENSOR_STATUS_START, _POSITION_START = CONFIGURATION_SIZE, CONFIGURATION_SIZE + 1
 
 
 @njit(
     "uint64(float64[::1], float64[::1], float64[::1], int64[::1], int64[::1], int64[::1], int64[::1],"
     " int64[::1], int64[::1], int64, uint64, int64, float64)",
-    depends=("dbc.e2e", "plant_sim"),
+    depends=(*e2e.SOURCES, "plant_sim"),
 )
 def run_period(  # type: ignore[no-untyped-def]
     state,
@@ -75,7 +76,7 @@ def run_period(  # type: ignore[no-untyped-def]
         The last period's row on entry, this one's on return.
     drive : array of int64
         See `plant_sim.drive`.
-    receiver : array of int64, shape (e2e.STATE_SIZE,)
+    receiver : array of int64, shape (dbc.profile2.STATE_SIZE,)
         E2E state of DriveCommand.
     command, feedback : array of int64
         Layouts of DriveCommand and PositionFeedback, from `dbc.codec.MessageCodec.protected_layout`.
@@ -99,7 +100,7 @@ def run_period(  # type: ignore[no-untyped-def]
     row[PRESSURE_B] = state[at.PRESSURE_B]
     row[PRESSURE_ACCUMULATOR] = accumulator_pressure(state[at.OIL_VOLUME], parameters)
     row[MOTOR_SPEED] = state[at.MOTOR_SPEED]
-    status = e2e.profile2_check(receiver, command[: e2e.CONFIGURATION_SIZE], data, arrived)
+    status = e2e.profile2_check(receiver, command[:CONFIGURATION_SIZE], data, arrived)
     payload = np.int64(data)
     controlword = (payload >> command[_CONTROLWORD_START]) & 0xFFFF
     target = (((payload >> command[_TARGET_START]) & 0xFFFF) ^ 0x8000) - 0x8000
@@ -109,4 +110,4 @@ def run_period(  # type: ignore[no-untyped-def]
         return np.uint64(0)
     reading = sensor[STATUS] << feedback[_SENSOR_STATUS_START]
     reading |= (reported_um(sensor, state[at.POSITION] + error_m) & 0xFFFF_FFFF) << feedback[_POSITION_START]
-    return e2e.profile2_protect(counter, feedback[: e2e.CONFIGURATION_SIZE], np.uint64(reading))
+    return e2e.profile2_protect(counter, feedback[:CONFIGURATION_SIZE], np.uint64(reading))

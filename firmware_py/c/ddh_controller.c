@@ -4,7 +4,7 @@
  */
 #include "ddh_controller.h"
 
-/* What the code takes for granted, and C99 leaves to the compiler: >> of a negative number keeps its sign,
+/* What the code takes for granted and C99 leaves to the compiler: >> of a negative number keeps its sign,
  * narrowing keeps the low bits.
  */
 typedef char ddh_assert_narrowing[(int32_t)UINT32_MAX == (int32_t)-1 ? 1 : -1];
@@ -35,6 +35,355 @@ static int32_t clz(int64_t value)
     }
     return count + 1;
 #endif
+}
+
+/* profile2: AUTOSAR end-to-end protection, profile 2, in restricted Python: CRC-8, protect, check.
+ *
+ * The receiver's state and configuration lie in flat arrays, from a given index on. A payload is two 32-bit
+ * words, byte 0 in the low eight bits of low. See dbc.e2e for the specification it follows.
+ */
+
+enum {
+    DDH_MAX_COUNTER = 15,
+};
+
+/* what a check comes to, with the values of E2E_P02CheckStatusType */
+enum {
+    DDH_OK = 0,
+    DDH_NONEWDATA = 1,
+    DDH_WRONGCRC = 2,
+    DDH_SYNC = 3,
+    DDH_INITIAL = 4,
+    DDH_REPEATED = 8,
+    DDH_OKSOMELOST = 32,
+    DDH_WRONGSEQUENCE = 64,
+};
+
+/* a receiver's configuration: 16 DataIDs, then */
+enum {
+    DDH_DLC = 16, /* payload length in bytes */
+    DDH_MAX_DELTA_COUNTER_INIT = 17,
+    DDH_MAX_NO_NEW_OR_REPEATED_DATA = 18,
+    DDH_SYNC_COUNTER_INIT = 19,
+    DDH_CONFIGURATION_SIZE = 20,
+};
+
+/* a receiver's state */
+enum {
+    DDH_NOT_FIRST = 0, /* whether there has been valid data */
+    DDH_LAST_VALID_COUNTER = 1,
+    DDH_MAX_DELTA_COUNTER = 2,
+    DDH_SYNC_COUNTER = 3,
+    DDH_NO_NEW_OR_REPEATED_DATA_COUNTER = 4,
+    DDH_LOST_DATA = 5,
+    DDH_STATE_SIZE = 6,
+};
+
+/* of a byte: its remainder by the polynomial 0x2F */
+static const uint8_t DDH_CRC_TABLE[256] = {
+    0x00, 0x2F, 0x5E, 0x71, 0xBC, 0x93, 0xE2, 0xCD, 0x57, 0x78, 0x09, 0x26, 0xEB, 0xC4, 0xB5, 0x9A, 0xAE, 0x81,
+    0xF0, 0xDF, 0x12, 0x3D, 0x4C, 0x63, 0xF9, 0xD6, 0xA7, 0x88, 0x45, 0x6A, 0x1B, 0x34, 0x73, 0x5C, 0x2D, 0x02,
+    0xCF, 0xE0, 0x91, 0xBE, 0x24, 0x0B, 0x7A, 0x55, 0x98, 0xB7, 0xC6, 0xE9, 0xDD, 0xF2, 0x83, 0xAC, 0x61, 0x4E,
+    0x3F, 0x10, 0x8A, 0xA5, 0xD4, 0xFB, 0x36, 0x19, 0x68, 0x47, 0xE6, 0xC9, 0xB8, 0x97, 0x5A, 0x75, 0x04, 0x2B,
+    0xB1, 0x9E, 0xEF, 0xC0, 0x0D, 0x22, 0x53, 0x7C, 0x48, 0x67, 0x16, 0x39, 0xF4, 0xDB, 0xAA, 0x85, 0x1F, 0x30,
+    0x41, 0x6E, 0xA3, 0x8C, 0xFD, 0xD2, 0x95, 0xBA, 0xCB, 0xE4, 0x29, 0x06, 0x77, 0x58, 0xC2, 0xED, 0x9C, 0xB3,
+    0x7E, 0x51, 0x20, 0x0F, 0x3B, 0x14, 0x65, 0x4A, 0x87, 0xA8, 0xD9, 0xF6, 0x6C, 0x43, 0x32, 0x1D, 0xD0, 0xFF,
+    0x8E, 0xA1, 0xE3, 0xCC, 0xBD, 0x92, 0x5F, 0x70, 0x01, 0x2E, 0xB4, 0x9B, 0xEA, 0xC5, 0x08, 0x27, 0x56, 0x79,
+    0x4D, 0x62, 0x13, 0x3C, 0xF1, 0xDE, 0xAF, 0x80, 0x1A, 0x35, 0x44, 0x6B, 0xA6, 0x89, 0xF8, 0xD7, 0x90, 0xBF,
+    0xCE, 0xE1, 0x2C, 0x03, 0x72, 0x5D, 0xC7, 0xE8, 0x99, 0xB6, 0x7B, 0x54, 0x25, 0x0A, 0x3E, 0x11, 0x60, 0x4F,
+    0x82, 0xAD, 0xDC, 0xF3, 0x69, 0x46, 0x37, 0x18, 0xD5, 0xFA, 0x8B, 0xA4, 0x05, 0x2A, 0x5B, 0x74, 0xB9, 0x96,
+    0xE7, 0xC8, 0x52, 0x7D, 0x0C, 0x23, 0xEE, 0xC1, 0xB0, 0x9F, 0xAB, 0x84, 0xF5, 0xDA, 0x17, 0x38, 0x49, 0x66,
+    0xFC, 0xD3, 0xA2, 0x8D, 0x40, 0x6F, 0x1E, 0x31, 0x76, 0x59, 0x28, 0x07, 0xCA, 0xE5, 0x94, 0xBB, 0x21, 0x0E,
+    0x7F, 0x50, 0x9D, 0xB2, 0xC3, 0xEC, 0xD8, 0xF7, 0x86, 0xA9, 0x64, 0x4B, 0x3A, 0x15, 0x8F, 0xA0, 0xD1, 0xFE,
+    0x33, 0x1C, 0x6D, 0x42
+};
+
+/* CRC of a payload of length bytes, 2..8, and the DataID of its counter (SWS_E2E_00133).
+ *
+ * CRC-8 with polynomial 0x2F, initial value and final XOR 0xFF, over bytes 1 to length - 1 and the DataID.
+ */
+static int32_t profile2_crc(int32_t low, int32_t high, int32_t length, int32_t data_id)
+{
+    int32_t crc = 0xFF;
+    int32_t word = low >> 8;
+    int32_t position = 1;
+    while (position < length) {
+        if (position == 4) {
+            word = high;
+        }
+        crc = (int32_t)DDH_CRC_TABLE[(crc ^ word) & 0xFF];
+        word = word >> 8;
+        position = position + 1;
+    }
+    return (int32_t)DDH_CRC_TABLE[(crc ^ data_id) & 0xFF] ^ 0xFF;
+}
+
+/* E2E_P02Protect: the payload's low word with the counter, 0..15, and the CRC filled in. */
+static int32_t profile2_protect(const int32_t *configuration, int32_t configured, int32_t counter, int32_t low,
+        int32_t high)
+{
+    int32_t word = (low & (-0x1000)) | shl32(counter, 8);
+    return word | profile2_crc(word, high, configuration[configured + DDH_DLC], configuration[configured +
+            counter]);
+}
+
+/* Whether the data may be used (E2E_P02MapStatusToSM with the R4.2 profile behaviour). */
+static int32_t profile2_is_accepted(int32_t status)
+{
+    if ((status == DDH_OK) || (status == DDH_OKSOMELOST) || (status == DDH_SYNC)) {
+        return 1;
+    }
+    return 0;
+}
+
+/* E2E_P02Check: the status of one received payload.
+ *
+ * Parameters
+ * ----------
+ * state : array, STATE_SIZE words from received on
+ *     The receiver's state, updated in place; all zero at power-on.
+ * configuration : array, CONFIGURATION_SIZE words from configured on
+ *     See dbc.e2e.receiver_configuration.
+ * low, high : int32
+ *     The payload.
+ * has_arrived : int32
+ *     0 if nothing arrived since the last call; the payload is not looked at then.
+ */
+static int32_t profile2_check(int32_t *state, int32_t received, const int32_t *configuration, int32_t configured,
+        int32_t low, int32_t high, int32_t has_arrived)
+{
+    if (state[received + DDH_MAX_DELTA_COUNTER] < DDH_MAX_COUNTER) {
+        state[received + DDH_MAX_DELTA_COUNTER] = (int32_t)(state[received + DDH_MAX_DELTA_COUNTER] + 1);
+    }
+    int32_t silence = state[received + DDH_NO_NEW_OR_REPEATED_DATA_COUNTER];
+    int32_t longer_silence = silence;
+    if (silence < DDH_MAX_COUNTER) {
+        longer_silence = (int32_t)(silence + 1);
+    }
+    if (has_arrived == 0) {
+        state[received + DDH_NO_NEW_OR_REPEATED_DATA_COUNTER] = longer_silence;
+        return DDH_NONEWDATA;
+    }
+    int32_t counter = (low >> 8) & DDH_MAX_COUNTER;
+    int32_t crc = profile2_crc(low, high, configuration[configured + DDH_DLC], configuration[configured + counter]);
+    if (crc != (low & 0xFF)) {
+        return DDH_WRONGCRC;
+    }
+    int32_t delta = (counter - state[received + DDH_LAST_VALID_COUNTER]) & DDH_MAX_COUNTER;
+    int32_t status = DDH_OK;
+    if (state[received + DDH_NOT_FIRST] == 0) {
+        state[received + DDH_NOT_FIRST] = 1;
+        status = DDH_INITIAL;
+    } else if (delta == 0) {
+        state[received + DDH_NO_NEW_OR_REPEATED_DATA_COUNTER] = longer_silence;
+        return DDH_REPEATED;
+    } else if (delta > state[received + DDH_MAX_DELTA_COUNTER]) { /* SWS_E2E_00145: the counter jumped too far */
+        state[received + DDH_NO_NEW_OR_REPEATED_DATA_COUNTER] = 0;
+        state[received + DDH_SYNC_COUNTER] = configuration[configured + DDH_SYNC_COUNTER_INIT];
+        if (configuration[configured + DDH_SYNC_COUNTER_INIT] == 0) {
+            return DDH_WRONGSEQUENCE;
+        }
+        status = DDH_WRONGSEQUENCE;
+    } else { /* SWS_E2E_00298, 00299: good once enough counters in a row were valid */
+        state[received + DDH_NO_NEW_OR_REPEATED_DATA_COUNTER] = 0;
+        state[received + DDH_LOST_DATA] = (int32_t)(delta - 1);
+        if (silence > configuration[configured + DDH_MAX_NO_NEW_OR_REPEATED_DATA]) {
+            state[received + DDH_SYNC_COUNTER] = configuration[configured + DDH_SYNC_COUNTER_INIT];
+            status = DDH_SYNC;
+        } else if (state[received + DDH_SYNC_COUNTER] > 0) {
+            state[received + DDH_SYNC_COUNTER] = (int32_t)(state[received + DDH_SYNC_COUNTER] - 1);
+            status = DDH_SYNC;
+        } else if (delta > 1) {
+            status = DDH_OKSOMELOST;
+        }
+    }
+    state[received + DDH_MAX_DELTA_COUNTER] = configuration[configured + DDH_MAX_DELTA_COUNTER_INIT];
+    state[received + DDH_LAST_VALID_COUNTER] = counter;
+    return status;
+}
+
+/* signals: Signals in a payload of two 32-bit words, byte 0 in the low eight bits of the first. */
+
+/* Value of the signal of length bits from bit start on; 1 to 31 bits, 32 if signed. */
+static int32_t extract(int32_t low, int32_t high, int32_t start, int32_t length, int32_t is_signed)
+{
+    int64_t payload = shl64((int64_t)high, 32) | ((int64_t)low & INT64_C(0xFFFFFFFF));
+    int64_t value = (payload >> start) & (shl64((int64_t)1, length) - 1);
+    if (is_signed != 0) {
+        int64_t sign = shl64((int64_t)1, length - 1);
+        value = (value ^ sign) - sign;
+    }
+    return (int32_t)value;
+}
+
+/* Make frame one of message, all signals 0. */
+static void begin(int32_t *frames, int32_t frame, const int32_t *contract, int32_t message)
+{
+    frames[frame + DDH_FRAME_ID] = contract[message + DDH_MESSAGE_ID];
+    frames[frame + DDH_FRAME_LENGTH] = contract[message + DDH_MESSAGE_LENGTH];
+    frames[frame + DDH_FRAME_LOW] = 0;
+    frames[frame + DDH_FRAME_HIGH] = 0;
+}
+
+/* Set a signal that is still 0 to the low bits of value. */
+static void insert(int32_t *frames, int32_t frame, const int32_t *contract, int32_t signal, int32_t value)
+{
+    int32_t start = contract[signal];
+    int64_t bits = (int64_t)value & (shl64((int64_t)1, contract[signal + 1]) - 1);
+    if (start < 32) {
+        bits = shl64(bits, start);
+        frames[frame + DDH_FRAME_LOW] = frames[frame + DDH_FRAME_LOW] | (int32_t)(uint32_t)bits;
+        bits = bits >> 32;
+    } else {
+        bits = shl64(bits, start - 32);
+    }
+    frames[frame + DDH_FRAME_HIGH] = frames[frame + DDH_FRAME_HIGH] | (int32_t)(uint32_t)bits;
+}
+
+/* mailbox: Receive mailboxes: the newest frame of each id, its E2E check, its signals, how long it has been
+ * missing.
+ *
+ * receive (receive interrupt) writes a mailbox, poll (timer interrupt) reads it. A mailbox begins at index
+ * mailbox of mailboxes, what is expected of its message at index expected of contract.
+ */
+
+/* Begin as at power-on: nothing received, stale. */
+static void clear(int32_t *mailboxes, int32_t mailbox, const int32_t *contract, int32_t expected)
+{
+    for (int32_t word = 0; word < DDH_MAILBOX_SIZE; word++) {
+        mailboxes[mailbox + word] = 0;
+    }
+    mailboxes[mailbox + DDH_STALE] = 1;
+    mailboxes[mailbox + DDH_AGE] = contract[expected + DDH_STALE_PERIODS];
+}
+
+/* Store a frame of length bytes; one that has not been read is overwritten, and counted. */
+static void take(int32_t *mailboxes, int32_t mailbox, int32_t length, int32_t low, int32_t high)
+{
+    if ((mailboxes[mailbox + DDH_ARRIVED] != 0) && (mailboxes[mailbox + DDH_OVERRUNS] < DDH_COUNT_MAX)) {
+        mailboxes[mailbox + DDH_OVERRUNS] = (int32_t)(mailboxes[mailbox + DDH_OVERRUNS] + 1);
+    }
+    mailboxes[mailbox + DDH_ARRIVED] = 1;
+    mailboxes[mailbox + DDH_LOW] = low;
+    mailboxes[mailbox + DDH_HIGH] = high;
+    mailboxes[mailbox + DDH_LENGTH] = length;
+}
+
+/* Extract the signals; use them only if all are plausible. */
+static void take_values(int32_t *mailboxes, int32_t mailbox, const int32_t *contract, int32_t expected)
+{
+    int32_t low = mailboxes[mailbox + DDH_LOW];
+    int32_t high = mailboxes[mailbox + DDH_HIGH];
+    mailboxes[mailbox + DDH_INVALID] = 0;
+    int32_t field = expected + DDH_FIELDS;
+    int32_t number = 0;
+    while (number < contract[expected + DDH_FIELD_COUNT]) {
+        int32_t value = extract(low, high, contract[field], contract[field + 1], contract[field + 2]);
+        mailboxes[mailbox + DDH_CANDIDATES + number] = value;
+        if ((value < contract[field + 3]) || (value > contract[field + 4])) {
+            mailboxes[mailbox + DDH_INVALID] = 1;
+        }
+        field = field + DDH_FIELD_SIZE;
+        number = number + 1;
+    }
+    if (mailboxes[mailbox + DDH_INVALID] == 0) {
+        for (int32_t word = 0; word < DDH_MAX_FIELDS; word++) {
+            mailboxes[mailbox + DDH_VALUES + word] = mailboxes[mailbox + DDH_CANDIDATES + word];
+        }
+        mailboxes[mailbox + DDH_IS_NEW] = 1;
+        mailboxes[mailbox + DDH_AGE] = 0;
+        mailboxes[mailbox + DDH_PHASE] = 0;
+    }
+}
+
+/* Check what arrived since the last period. A frame of a wrong length is none to the E2E check. */
+static void poll(int32_t *mailboxes, int32_t mailbox, const int32_t *contract, int32_t expected)
+{
+    int32_t has_arrived = mailboxes[mailbox + DDH_ARRIVED];
+    int32_t is_frame = has_arrived;
+    if (mailboxes[mailbox + DDH_LENGTH] != contract[expected + DDH_DLC]) {
+        is_frame = 0;
+    }
+    mailboxes[mailbox + DDH_IS_NEW] = 0;
+    if (mailboxes[mailbox + DDH_AGE] < contract[expected + DDH_STALE_PERIODS]) {
+        mailboxes[mailbox + DDH_AGE] = (int32_t)(mailboxes[mailbox + DDH_AGE] + 1);
+    }
+    int32_t phase = mailboxes[mailbox + DDH_PHASE] + 1;
+    if (phase >= contract[expected + DDH_CYCLE_PERIODS]) {
+        phase = 0;
+    }
+    mailboxes[mailbox + DDH_PHASE] = phase;
+    if ((has_arrived != 0) || (phase == 0)) {
+        int32_t low = mailboxes[mailbox + DDH_LOW];
+        int32_t high = mailboxes[mailbox + DDH_HIGH];
+        int32_t status = profile2_check(mailboxes, mailbox, contract, expected, low, high, is_frame);
+        int32_t is_accepted = profile2_is_accepted(status);
+        if (has_arrived != 0) {
+            mailboxes[mailbox + DDH_CORRUPT] = 1;
+            if ((is_accepted != 0) || (status == DDH_INITIAL)) {
+                mailboxes[mailbox + DDH_CORRUPT] = 0;
+            }
+        }
+        if (is_accepted != 0) {
+            take_values(mailboxes, mailbox, contract, expected);
+        }
+    }
+    mailboxes[mailbox + DDH_ARRIVED] = 0;
+    mailboxes[mailbox + DDH_STALE] = 0;
+    if (mailboxes[mailbox + DDH_AGE] >= contract[expected + DDH_STALE_PERIODS]) {
+        mailboxes[mailbox + DDH_STALE] = 1;
+    }
+}
+
+/* state_machine: The controller's states, and what moves it from one to the next, as data. */
+
+/* states, as in ControllerStatus */
+enum {
+    DDH_POWER_ON = 0,
+    DDH_STANDBY = 1,
+    DDH_RUN = 2,
+    DDH_SAFE = 3,
+};
+
+/* conditions: what is true in this period, one bit each */
+enum {
+    DDH_CALIBRATED = 1,
+    DDH_INPUTS_FRESH = 2,
+    DDH_ENABLE = 4,
+    DDH_DRIVE_ENABLED = 8,
+    DDH_FAULT_RESET = 16,
+    DDH_READY_TO_ENABLE = 6,
+};
+
+/* a transition: leave SOURCE for TARGET when all of WHEN and none of UNLESS hold */
+enum {
+    DDH_SOURCE = 0,
+    DDH_WHEN = 1,
+    DDH_UNLESS = 2,
+    DDH_TARGET = 3,
+};
+
+static const uint8_t DDH_TRANSITIONS[6][4] = {
+    {DDH_POWER_ON, DDH_CALIBRATED, 0, DDH_STANDBY},
+    {DDH_STANDBY, DDH_READY_TO_ENABLE | DDH_DRIVE_ENABLED, 0, DDH_RUN},
+    {DDH_RUN, 0, DDH_INPUTS_FRESH, DDH_SAFE},
+    {DDH_RUN, 0, DDH_ENABLE, DDH_STANDBY},
+    {DDH_RUN, 0, DDH_DRIVE_ENABLED, DDH_SAFE},
+    {DDH_SAFE, DDH_FAULT_RESET | DDH_INPUTS_FRESH, 0, DDH_STANDBY},
+};
+
+/* Target of the first transition that applies, or state. */
+static int32_t next_state(int32_t state, int32_t conditions)
+{
+    for (int32_t row = 0; row < 6; row++) {
+        int32_t when = (int32_t)DDH_TRANSITIONS[row][DDH_WHEN];
+        int32_t unless = conditions & (int32_t)DDH_TRANSITIONS[row][DDH_UNLESS];
+        if (((int32_t)DDH_TRANSITIONS[row][DDH_SOURCE] == state) && ((conditions & when) == when) && (unless ==
+                0)) {
+            return (int32_t)DDH_TRANSITIONS[row][DDH_TARGET];
+        }
+    }
+    return state;
 }
 
 /* fixedpoint: Fixed-point arithmetic: one rounding rule (half up), saturation, and an exact integer square root. */
@@ -247,6 +596,7 @@ static int32_t nfcl(const int32_t *calibration, const int32_t *state)
 /* td: Tracking differentiator (eq. 18) on fhan (eq. 19). */
 
 #define DDH_WORK_LIMIT INT64_C(17179869184) /* 1 m in 2^-34 m */
+
 /* Start at rest at position (2^-31 m). */
 static void td_reset(int32_t *state, int32_t position)
 {
@@ -475,6 +825,7 @@ static int32_t pi_ff_step(const int32_t *calibration, int32_t *state, int32_t li
  */
 
 #define DDH_ONE INT64_C(281474976710656) /* 1 of the ratios, squared */
+
 enum {
     DDH_RATIO_SHIFT = 24, /* LSB of the ratios: 2^-24 */
 };
@@ -683,4 +1034,401 @@ void ddh_control_step(const int32_t *calibration, int32_t *state, int32_t *io)
     io[DDH_IO_TARGET_VELOCITY] = velocity;
     io[DDH_IO_FLAGS] = flags;
     io[DDH_IO_SATURATIONS] = state[DDH_ST_SATURATIONS];
+}
+
+/* task: The control task: what the receive and timer interrupts do.
+ *
+ * state, io and calibration are the kernel's, see firmware_py.kernel.layout; for the other arrays see
+ * firmware_py.task_layout. A payload is two 32-bit words, byte 0 in the low eight bits of low.
+ */
+
+enum {
+    DDH_ASSUMED_EXECUTION_TIME = 20, /* 0.5 % */
+    DDH_STATUS_PERIODS = 100,
+    DDH_OBSERVER_PERIODS = 10,
+    DDH_OBSERVER_DUE = 7, /* its phase */
+    DDH_OBSERVER_PAGES = 7,
+    DDH_BENCH_RESET = 1, /* BenchControl's command */
+};
+
+/* faults of each mailbox */
+enum {
+    DDH_IF_LOST = 0,
+    DDH_IF_CORRUPT = 1,
+    DDH_IF_INVALID = 2,
+};
+
+/* CiA 402: controlwords, masks and values of the statusword */
+enum {
+    DDH_DISABLE_VOLTAGE = 0,
+    DDH_QUICK_STOP = 2,
+    DDH_SHUTDOWN = 6,
+    DDH_SWITCH_ON = 7,
+    DDH_ENABLE_OPERATION = 15,
+    DDH_RESET_FAULT = 128,
+    DDH_STATE_MASK = 111,
+    DDH_OPERATION_ENABLED = 39,
+    DDH_FAULT_BIT = 8, /* set while the fault reaction is active too */
+    DDH_FAULT_MASK = 79,
+    DDH_IN_FAULT = 8,
+};
+
+/* mask and value of the statusword, and the controlword that leads on from there */
+enum {
+    DDH_MASK = 0,
+    DDH_VALUE = 1,
+    DDH_LEADS_ON = 2,
+};
+
+static const int32_t DDH_MAILBOX_FAULTS[4][3] = {
+    {DDH_FEEDBACK_LOST, DDH_FEEDBACK_CORRUPT, DDH_FEEDBACK_INVALID},
+    {DDH_SETPOINT_LOST, DDH_SETPOINT_CORRUPT, DDH_SETPOINT_INVALID},
+    {DDH_COMMAND_LOST, DDH_COMMAND_CORRUPT, 0},
+    {DDH_DRIVE_STATUS_LOST, DDH_DRIVE_STATUS_CORRUPT, 0},
+};
+
+static const uint8_t DDH_ENABLING[5][3] = {
+    {DDH_STATE_MASK, DDH_OPERATION_ENABLED, DDH_ENABLE_OPERATION},
+    {0x4F, 0x40, DDH_SHUTDOWN}, /* switch on disabled */
+    {DDH_STATE_MASK, 0x21, DDH_SWITCH_ON}, /* ready to switch on */
+    {DDH_STATE_MASK, 0x23, DDH_ENABLE_OPERATION}, /* switched on */
+    {DDH_STATE_MASK, 0x07, DDH_QUICK_STOP}, /* quick stop active: let it finish */
+};
+
+/* Empty all mailboxes. */
+static void empty(const int32_t *contract, int32_t *mailboxes)
+{
+    int32_t mailbox = 0;
+    int32_t expected = 0;
+    for (int32_t row = 0; row < DDH_MAILBOXES; row++) {
+        clear(mailboxes, mailbox, contract, expected);
+        mailbox = mailbox + DDH_MAILBOX_SIZE;
+        expected = expected + DDH_EXPECTATION_SIZE;
+    }
+}
+
+/* Begin as after power-on; what is known of calibration and execution time stays. */
+static void restart(int32_t *task, int32_t *state, int32_t *io)
+{
+    int32_t law = task[DDH_DEFAULT_LAW];
+    int32_t execution_time = task[DDH_EXECUTION_TIME];
+    for (int32_t word = 0; word < DDH_TASK_SIZE; word++) {
+        task[word] = 0;
+    }
+    for (int32_t word = 0; word < DDH_ST_SIZE; word++) {
+        state[word] = 0;
+    }
+    for (int32_t word = 0; word < DDH_IO_SIZE; word++) {
+        io[word] = 0;
+    }
+    task[DDH_DEFAULT_LAW] = law;
+    task[DDH_EXECUTION_TIME] = execution_time;
+}
+
+/* Power-on with a calibration for law, 0 if there is no valid one. */
+static void power_on(const int32_t *contract, int32_t *mailboxes, int32_t *task, int32_t *state, int32_t *io,
+        int32_t law)
+{
+    task[DDH_DEFAULT_LAW] = law;
+    task[DDH_EXECUTION_TIME] = DDH_ASSUMED_EXECUTION_TIME;
+    empty(contract, mailboxes);
+    restart(task, state, io);
+}
+
+/* Receive interrupt: latch. A reset forgets what came before it, not what comes after. */
+static void receive(const int32_t *contract, int32_t *mailboxes, int32_t *task, int32_t can_id, int32_t length,
+        int32_t low, int32_t high)
+{
+    int32_t mailbox = 0;
+    int32_t expected = 0;
+    for (int32_t row = 0; row < DDH_MAILBOXES; row++) {
+        if (can_id == contract[expected + DDH_EXPECTED_ID]) {
+            take(mailboxes, mailbox, length, low, high);
+        }
+        mailbox = mailbox + DDH_MAILBOX_SIZE;
+        expected = expected + DDH_EXPECTATION_SIZE;
+    }
+    int32_t bit = contract[DDH_BENCH_COMMAND];
+    int32_t bits = contract[DDH_BENCH_COMMAND + 1];
+    if ((can_id == contract[DDH_BENCH_CONTROL + DDH_MESSAGE_ID]) && (extract(low, high, bit, bits, 0) ==
+            DDH_BENCH_RESET)) {
+        empty(contract, mailboxes);
+        task[DDH_RESTART_ASKED] = 1;
+    }
+}
+
+/* Conditions of the state machine; moves task's ARMED and RESET_ASKED on. */
+static int32_t conditions_of(const int32_t *mailboxes, int32_t *task)
+{
+    int32_t enable = mailboxes[DDH_COMMAND_ENABLE];
+    int32_t reset_asked = mailboxes[DDH_COMMAND_FAULT_RESET];
+    int32_t conditions = 0;
+    if ((reset_asked != 0) && (task[DDH_RESET_ASKED] == 0)) {
+        conditions = conditions | DDH_FAULT_RESET;
+    }
+    task[DDH_RESET_ASKED] = reset_asked;
+    if ((task[DDH_STATE] != DDH_STANDBY) && (task[DDH_STATE] != DDH_RUN)) {
+        task[DDH_ARMED] = 0;
+    } else if ((mailboxes[DDH_COMMAND + DDH_IS_NEW] != 0) && (enable == 0)) {
+        task[DDH_ARMED] = 1;
+    }
+    if (task[DDH_DEFAULT_LAW] != 0) {
+        conditions = conditions | DDH_CALIBRATED;
+    }
+    int32_t stale = 0;
+    int32_t mailbox = 0;
+    for (int32_t row = 0; row < DDH_MAILBOXES; row++) {
+        stale = stale | mailboxes[mailbox + DDH_STALE];
+        mailbox = mailbox + DDH_MAILBOX_SIZE;
+    }
+    if (stale == 0) {
+        conditions = conditions | DDH_INPUTS_FRESH;
+    }
+    if ((enable != 0) && (task[DDH_ARMED] != 0)) {
+        conditions = conditions | DDH_ENABLE;
+    }
+    if ((mailboxes[DDH_STATUSWORD] & DDH_STATE_MASK) == DDH_OPERATION_ENABLED) {
+        conditions = conditions | DDH_DRIVE_ENABLED;
+    }
+    return conditions;
+}
+
+/* Fault bits; before is the state of the last period. */
+static int32_t faults_of(const int32_t *mailboxes, const int32_t *task, int32_t before)
+{
+    int32_t faults = 0;
+    int32_t mailbox = 0;
+    for (int32_t row = 0; row < DDH_MAILBOXES; row++) {
+        if (mailboxes[mailbox + DDH_STALE] != 0) {
+            faults = faults | DDH_MAILBOX_FAULTS[row][DDH_IF_LOST];
+            if (mailboxes[mailbox + DDH_CORRUPT] != 0) {
+                faults = faults | DDH_MAILBOX_FAULTS[row][DDH_IF_CORRUPT];
+            }
+            if (mailboxes[mailbox + DDH_INVALID] != 0) {
+                faults = faults | DDH_MAILBOX_FAULTS[row][DDH_IF_INVALID];
+            }
+        }
+        if (mailboxes[mailbox + DDH_OVERRUNS] != 0) {
+            faults = faults | DDH_MAILBOX_OVERRUN;
+        }
+        mailbox = mailbox + DDH_MAILBOX_SIZE;
+    }
+    if (task[DDH_DEFAULT_LAW] == 0) {
+        faults = faults | DDH_CALIBRATION_INVALID;
+    }
+    int32_t statusword = mailboxes[DDH_STATUSWORD];
+    if ((statusword & DDH_FAULT_BIT) != 0) {
+        faults = faults | DDH_DRIVE_FAULT;
+    }
+    if (task[DDH_STATE] == DDH_SAFE) {
+        if ((before == DDH_RUN) && ((statusword & DDH_STATE_MASK) != DDH_OPERATION_ENABLED)) {
+            faults = faults | DDH_DRIVE_NOT_ENABLED;
+        }
+        faults = faults | task[DDH_FAULTS];
+    }
+    return faults;
+}
+
+/* One step of the control law; a reset of it before, where the task has_entered the run state. */
+static void control(const int32_t *mailboxes, int32_t *task, const int32_t *calibration, int32_t *state,
+        int32_t *io, int32_t has_entered)
+{
+    io[DDH_IO_SETPOINT] = mailboxes[DDH_SETPOINT_POSITION];
+    io[DDH_IO_POSITION] = mailboxes[DDH_FEEDBACK_POSITION];
+    if (has_entered != 0) {
+        io[DDH_IO_LAW] = mailboxes[DDH_COMMAND_LAW];
+        if (io[DDH_IO_LAW] == 0) {
+            io[DDH_IO_LAW] = task[DDH_DEFAULT_LAW];
+        }
+        ddh_control_reset(calibration, state, io);
+    }
+    ddh_control_step(calibration, state, io);
+    task[DDH_VELOCITY] = io[DDH_IO_TARGET_VELOCITY];
+    if (((io[DDH_IO_FLAGS] & DDH_FLAG_SPEED_LIMITED) != 0) && (task[DDH_SATURATIONS] < DDH_COUNT_MAX)) {
+        task[DDH_SATURATIONS] = (int32_t)(task[DDH_SATURATIONS] + 1);
+    }
+}
+
+/* Controlword that answers the drive's statusword. */
+static int32_t controlword_for(int32_t statusword, const int32_t *task, int32_t conditions)
+{
+    if (task[DDH_STATE] == DDH_SAFE) {
+        return DDH_QUICK_STOP;
+    }
+    if (statusword == 0) { /* the drive has not been heard of */
+        return DDH_DISABLE_VOLTAGE;
+    }
+    if ((statusword & DDH_FAULT_MASK) == DDH_IN_FAULT) {
+        if (task[DDH_RESET_ASKED] != 0) {
+            return DDH_RESET_FAULT;
+        }
+        return DDH_DISABLE_VOLTAGE;
+    }
+    if ((task[DDH_STATE] != DDH_RUN) && ((conditions & DDH_READY_TO_ENABLE) != DDH_READY_TO_ENABLE)) {
+        return DDH_SHUTDOWN;
+    }
+    for (int32_t row = 0; row < 5; row++) {
+        if ((statusword & (int32_t)DDH_ENABLING[row][DDH_MASK]) == (int32_t)DDH_ENABLING[row][DDH_VALUE]) {
+            return (int32_t)DDH_ENABLING[row][DDH_LEADS_ON];
+        }
+    }
+    return DDH_DISABLE_VOLTAGE;
+}
+
+/* DriveCommand, the first frame. */
+static void send_command(const int32_t *contract, int32_t *task, int32_t *frames)
+{
+    int32_t counter = (task[DDH_COMMAND_COUNTER] + 1) & DDH_MAX_COUNTER;
+    begin(frames, 0, contract, DDH_DRIVE_COMMAND);
+    insert(frames, 0, contract, DDH_SENT_CONTROLWORD, task[DDH_CONTROLWORD]);
+    insert(frames, 0, contract, DDH_SENT_VELOCITY, task[DDH_VELOCITY]);
+    frames[DDH_FRAME_LOW] = profile2_protect(contract, DDH_PROTECTION, counter, frames[DDH_FRAME_LOW],
+            frames[DDH_FRAME_HIGH]);
+    task[DDH_COMMAND_COUNTER] = counter;
+}
+
+/* ControllerStatus. */
+static void send_status(const int32_t *contract, const int32_t *mailboxes, const int32_t *task, const int32_t *io,
+        int32_t *frames, int32_t frame)
+{
+    int32_t law = io[DDH_IO_LAW];
+    if (law == 0) {
+        law = task[DDH_DEFAULT_LAW];
+    }
+    int32_t overruns = 0;
+    int32_t mailbox = 0;
+    for (int32_t row = 0; row < DDH_MAILBOXES; row++) {
+        overruns = overruns + mailboxes[mailbox + DDH_OVERRUNS];
+        mailbox = mailbox + DDH_MAILBOX_SIZE;
+    }
+    if (overruns > DDH_COUNT_MAX) {
+        overruns = DDH_COUNT_MAX;
+    }
+    begin(frames, frame, contract, DDH_CONTROLLER_STATUS);
+    insert(frames, frame, contract, DDH_SENT_STATE, task[DDH_STATE]);
+    insert(frames, frame, contract, DDH_SENT_LAW, law);
+    int32_t signal = DDH_SENT_FAULTS;
+    for (int32_t fault = 0; fault < DDH_FAULT_COUNT; fault++) {
+        insert(frames, frame, contract, signal, task[DDH_FAULTS] >> fault);
+        signal = signal + DDH_SIGNAL_SIZE;
+    }
+    insert(frames, frame, contract, DDH_SENT_EXECUTION_TIME, task[DDH_EXECUTION_TIME]);
+    insert(frames, frame, contract, DDH_SENT_SATURATIONS, task[DDH_SATURATIONS]);
+    insert(frames, frame, contract, DDH_SENT_OVERRUNS, overruns);
+}
+
+/* ObserverState: one of its pages after the other. */
+static void send_observer(const int32_t *contract, const int32_t *task, const int32_t *state, int32_t *frames,
+        int32_t frame)
+{
+    begin(frames, frame, contract, DDH_OBSERVER_STATE);
+    insert(frames, frame, contract, DDH_SENT_PAGE, task[DDH_OBSERVER_PAGE]);
+    insert(frames, frame, contract, DDH_SENT_CYCLE, task[DDH_CYCLE]);
+    insert(frames, frame, contract, DDH_SENT_VALUE, state[DDH_ST_V1 + task[DDH_OBSERVER_PAGE]]);
+}
+
+/* Move on to the next period. */
+static void count_period(int32_t *task)
+{
+    task[DDH_CYCLE] = (task[DDH_CYCLE] + 1) & 0xFFFF;
+    task[DDH_STATUS_PHASE] = (int32_t)(task[DDH_STATUS_PHASE] + 1);
+    if (task[DDH_STATUS_PHASE] == DDH_STATUS_PERIODS) {
+        task[DDH_STATUS_PHASE] = 0;
+    }
+    task[DDH_OBSERVER_PHASE] = (int32_t)(task[DDH_OBSERVER_PHASE] + 1);
+    if (task[DDH_OBSERVER_PHASE] == DDH_OBSERVER_PERIODS) {
+        task[DDH_OBSERVER_PHASE] = 0;
+        task[DDH_OBSERVER_PAGE] = (int32_t)(task[DDH_OBSERVER_PAGE] + 1);
+        if (task[DDH_OBSERVER_PAGE] == DDH_OBSERVER_PAGES) {
+            task[DDH_OBSERVER_PAGE] = 0;
+        }
+    }
+}
+
+/* Timer interrupt: one control period. The result is how many of frames are to be sent. */
+static int32_t period(const int32_t *contract, int32_t *mailboxes, int32_t *task, const int32_t *calibration,
+        int32_t *state, int32_t *io, int32_t *frames)
+{
+    if (task[DDH_RESTART_ASKED] != 0) {
+        restart(task, state, io);
+    }
+    int32_t mailbox = 0;
+    int32_t expected = 0;
+    for (int32_t row = 0; row < DDH_MAILBOXES; row++) {
+        poll(mailboxes, mailbox, contract, expected);
+        mailbox = mailbox + DDH_MAILBOX_SIZE;
+        expected = expected + DDH_EXPECTATION_SIZE;
+    }
+    int32_t conditions = conditions_of(mailboxes, task);
+    int32_t before = task[DDH_STATE];
+    task[DDH_STATE] = next_state(before, conditions);
+    task[DDH_FAULTS] = faults_of(mailboxes, task, before);
+    task[DDH_VELOCITY] = 0;
+    if (task[DDH_STATE] == DDH_RUN) {
+        int32_t has_entered = 0;
+        if (before != DDH_RUN) {
+            has_entered = 1;
+        }
+        control(mailboxes, task, calibration, state, io, has_entered);
+    }
+    task[DDH_CONTROLWORD] = controlword_for(mailboxes[DDH_STATUSWORD], task, conditions);
+    send_command(contract, task, frames);
+    int32_t frame = DDH_FRAME_SIZE;
+    int32_t count = 1;
+    if (task[DDH_STATUS_PHASE] == 0) {
+        send_status(contract, mailboxes, task, io, frames, frame);
+        frame = frame + DDH_FRAME_SIZE;
+        count = count + 1;
+    }
+    if (task[DDH_OBSERVER_PHASE] == DDH_OBSERVER_DUE) {
+        send_observer(contract, task, state, frames, frame);
+        count = count + 1;
+    }
+    count_period(task);
+    return count;
+}
+
+/* What the DBC file says; see DDH_CONTRACT_SIZE. */
+static const int32_t DDH_CONTRACT[DDH_CONTRACT_SIZE] = {
+    160, 106, 150, 165, 195, 144, 46, 156, 177, 71, 192, 170, 34, 212, 43, 159, 6, 1, 3, 1, 272, 1, 3, 2, 12, 4, 0,
+    0, 1, 16, 32, 1, -10000, 410000, 0, 0, 0, 0, 0, 63, 72, 75, 54, 204, 147, 135, 24, 15, 20, 114, 53, 116, 172,
+    102, 120, 6, 1, 3, 1, 288, 1, 3, 1, 16, 32, 1, -10000, 4010000, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 129, 207, 5, 225,
+    57, 113, 9, 83, 92, 238, 187, 136, 240, 68, 119, 166, 3, 1, 3, 1, 320, 100, 300, 3, 16, 1, 0, 0, 1, 17, 3, 0, 0,
+    7, 20, 1, 0, 0, 1, 45, 48, 126, 190, 125, 10, 36, 86, 201, 105, 141, 175, 249, 226, 221, 23, 6, 1, 3, 1, 384,
+    10, 30, 2, 16, 16, 0, 0, 65535, 32, 16, 1, -32768, 32767, 0, 0, 0, 0, 0, 12, 27, 77, 255, 78, 89, 180, 29, 183,
+    189, 228, 18, 39, 51, 58, 235, 6, 1, 3, 1, 256, 6, 16, 16, 32, 16, 768, 8, 0, 4, 4, 3, 8, 1, 9, 1, 10, 1, 11, 1,
+    12, 1, 13, 1, 14, 1, 15, 1, 16, 1, 17, 1, 18, 1, 19, 1, 20, 1, 21, 1, 24, 8, 32, 16, 48, 16, 1536, 8, 0, 8, 16,
+    16, 32, 32, -1610678271, 8, 0, 8
+};
+
+/* A 32-bit word in two's complement. */
+static int32_t signed_word(uint32_t word)
+{
+    return (word < 0x80000000U) ? (int32_t)word : ((int32_t)(word - 0x80000000U) - 2147483647 - 1);
+}
+
+void ddh_start(ddh_controller *controller)
+{
+    power_on(DDH_CONTRACT, controller->mailboxes, controller->task, controller->state, controller->io,
+            ddh_default_law);
+}
+
+void ddh_receive(ddh_controller *controller, uint32_t can_id, uint8_t length, uint64_t data)
+{
+    receive(DDH_CONTRACT, controller->mailboxes, controller->task, (int32_t)can_id, (int32_t)length,
+            (int32_t)(uint32_t)data, (int32_t)(uint32_t)(data >> 32));
+}
+
+int32_t ddh_period(ddh_controller *controller, ddh_frame frames[DDH_MAX_FRAMES])
+{
+    int32_t words[DDH_FRAMES_SIZE] = {0};
+    int32_t count = period(DDH_CONTRACT, controller->mailboxes, controller->task, ddh_calibration,
+            controller->state, controller->io, words);
+    for (int32_t i = 0; i < count; i++) {
+        const int32_t *frame = &words[i * DDH_FRAME_SIZE];
+        frames[i].can_id = (uint32_t)frame[DDH_FRAME_ID];
+        frames[i].length = (uint8_t)frame[DDH_FRAME_LENGTH];
+        frames[i].data = ((uint64_t)(uint32_t)frame[DDH_FRAME_HIGH] << 32) | (uint32_t)frame[DDH_FRAME_LOW];
+    }
+    return count;
 }

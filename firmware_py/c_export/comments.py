@@ -19,6 +19,8 @@ class Comments:
 
     Attributes
     ----------
+    lines : list of str
+        The source.
     beside : dict of int to str
         Comment at the end of a line of code, by line number.
     above : dict of int to str
@@ -26,12 +28,15 @@ class Comments:
     """
 
     def __init__(self, source: str) -> None:
+        self.lines = source.splitlines()
         self.beside: dict[int, str] = {}
         self.above: dict[int, str] = {}
         pending: list[str] = []
         for token in tokenize.generate_tokens(io.StringIO(source).readline):
             if token.type == tokenize.COMMENT:
                 text = token.string.lstrip("# ")
+                if text.startswith(("fmt:", "noqa")):
+                    continue
                 if token.line.lstrip().startswith("#"):
                     pending.append(text)
                 else:
@@ -41,6 +46,10 @@ class Comments:
             elif pending and token.type not in (tokenize.NL, tokenize.INDENT, tokenize.DEDENT):
                 self.above[token.start[0]] = " ".join(pending)
                 pending = []
+
+    def remark(self, line: int) -> str:
+        """Return the comment at the end of a line, for the end of one in C."""
+        return f" /* {self.beside[line]} */" if line in self.beside else ""
 
 
 def comment(text: str, indent: str = "") -> Iterator[str]:

@@ -4,7 +4,8 @@ import ast
 from collections.abc import Iterator, Mapping
 
 from firmware_py.c_export.comments import Comments, comment, docstring
-from firmware_py.c_export.functions import INDENT, ExportError, FunctionWriter, Names, c_integer
+from firmware_py.c_export.expressions import ExportError, ExpressionWriter, Names, c_integer, table_type
+from firmware_py.c_export.functions import INDENT, FunctionWriter, wrapped
 from firmware_py.kernel_check import MACHINE, analyse
 
 PREFIX = "DDH_"
@@ -16,9 +17,11 @@ class Program:
     Parameters
     ----------
     sources : mapping of str to (str, str)
-        Path and source of each module by its short name.
-    roots : tuple of str
-        Functions for others to call; they are named ``ddh_...``. What they do not reach is left out.
+        Path and source of each module by its name.
+    public : tuple of str
+        Functions for others to call; they are named ``ddh_...``.
+    internal : tuple of str
+        Further functions to export; what neither reach is left out.
 
     Raises
     ------
@@ -26,7 +29,9 @@ class Program:
         If a source leaves the subset, or uses something there is no C for.
     """
 
-    def __init__(self, sources: Mapping[str, tuple[str, str]], roots: tuple[str, ...]) -> None:
+    def __init__(
+        self, sources: Mapping[str, tuple[str, str]], public: tuple[str, ...], internal: tuple[str, ...]
+    ) -> None:
         modules, violations = analyse(sources)
         if violations:
             raise ExportError(violations[0])
@@ -39,25 +44,28 @@ class Program:
                 if isinstance(node, ast.FunctionDef):
                     self._define(name, node.name, node)
                     self._functions[node.name] = name, node
-            for constant in module.constants:
+            for constant in (*module.constants, *module.tables):
                 self._define(name, constant, module.tree)
         self._calls = {name: self._called_by(node) for name, (_, node) in self._functions.items()}
-        self._order = self._reached(roots)
+        self._order = self._reached((*public, *internal))
         self._names = Names(
-            functions={name: f"ddh_{name}" if name in roots else name.lstrip("_") for name in self._order},
+            functions={name: f"ddh_{name}" if name in public else name.lstrip("_") for name in self._order},
             constants={
                 name: PREFIX + name.lstrip("_")
                 for module in self._modules.values()
-                for name in module.constants
+                for name in (*module.constants, *module.tables)
+            },
+            tables={
+                name: table for module in self._modules.values() for name, table in module.tables.items()
             },
             changed=self._changed(),
         )
 
-    def prototypes(self, roots: tuple[str, ...]) -> Iterator[str]:
-        """Yield the heads of the functions for others to call, with their comments."""
-        for root in roots:
-            yield from comment(docstring(self._functions[root][1]))
-            yield f"{self._writer(root).prototype()};"
+    def prototypes(self, public: tuple[str, ...]) -> Iterator[str]:
+        """Yield the heads of functions for others to call, with their comments."""
+        for name in public:
+            yield from comment(docstring(self._functions[name][1]))
+            yield f"{self._writer(name).prototype()};"
             yield ""
 
     def constants(self, name: str) -> Iterator[str]:
@@ -68,23 +76,47 @@ class Program:
             match node:
                 case ast.Assign(targets=[ast.Name(id=constant)]) if constant in module.constants:
                     value = module.constants[constant]
-                    above, beside = (table.get(node.lineno) for table in (comments.above, comments.beside))
-                    remark = f" /* {beside} */" if beside else ""
                     is_wide = not -(2**31) <= value < 2**31
+                    above = comments.above.get(node.lineno)
+                    remark = comments.remark(node.lineno)
                     if is_open and (above or is_wide):
                         yield from ("};", "")
                         is_open = False
                     if above:
                         yield from comment(above)
+                    c_name = self._names.constants[constant]
                     if is_wide:
-                        yield f"#define {self._names.constants[constant]} {c_integer(value)}{remark}"
+                        yield from (f"#define {c_name} {c_integer(value)}{remark}", "")
                         continue
                     if not is_open:
                         yield "enum {"
                         is_open = True
-                    yield f"{INDENT}{self._names.constants[constant]} = {c_integer(value)},{remark}"
+                    yield f"{INDENT}{c_name} = {c_integer(value)},{remark}"
         if is_open:
             yield from ("};", "")
+
+    def tables(self, name: str) -> Iterator[str]:
+        """Yield a module's tables."""
+        module, comments = self._modules[name], self._comments[name]
+        write = ExpressionWriter(module, comments, self._names).plain
+        for node in module.tree.body:
+            match node:
+                case ast.Assign(targets=[ast.Name(id=table)], value=ast.Tuple(elts=elements)):
+                    values = module.tables[table]
+                    sizes = f"[{len(values)}]"
+                    if isinstance(values[0], tuple):
+                        sizes += f"[{len(values[0])}]"
+                    if above := comments.above.get(node.lineno):
+                        yield from comment(above)
+                    yield f"static const {table_type(values)} {self._names.constants[table]}{sizes} = {{"
+                    if isinstance(values[0], tuple):
+                        for row in elements:
+                            assert isinstance(row, ast.Tuple)
+                            words = ", ".join(map(write, row.elts))
+                            yield f"{INDENT}{{{words}}},{comments.remark(row.lineno)}"
+                    else:
+                        yield from wrapped(", ".join(map(write, elements)), INDENT, hanging="")
+                    yield from ("};", "")
 
     def module_names(self) -> list[str]:
         """Return the short names of the modules, each after those it calls."""
@@ -148,10 +180,8 @@ class Program:
 
         def visit(name: str) -> None:
             for node in self._modules[name].tree.body:
-                if isinstance(node, ast.ImportFrom):
-                    imported = (node.module or "").rpartition(".")[2]
-                    if imported in self._modules:
-                        visit(imported)
+                if isinstance(node, ast.ImportFrom) and node.module in self._modules:
+                    visit(node.module)
             order[name] = None
 
         for name in self._modules:

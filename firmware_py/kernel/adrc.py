@@ -1,7 +1,7 @@
 """Active disturbance rejection control: tracking differentiator, observer, feedback, in this order."""
 
+from dbc.machine import Array32, int32
 from firmware_py.kernel.eso import eso_reset, eso_step
-from firmware_py.kernel.machine import Array32, int32
 from firmware_py.kernel.nfcl import nfcl
 from firmware_py.kernel.td import td_reset, td_step
 

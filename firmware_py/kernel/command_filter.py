@@ -1,8 +1,8 @@
 """Command filter: slew limit and low-pass on the way to the drive, against chatter."""
 
+from dbc.machine import Array32, i32, i64, int32
 from firmware_py.kernel.fixedpoint import clamp, gain, sat32
 from firmware_py.kernel.layout import CAL_COMMAND_SLEW, CAL_COMMAND_SMOOTH, CAL_U_LIMIT, ST_COMMAND
-from firmware_py.kernel.machine import Array32, i32, i64, int32
 
 
 def command_filter_reset(state: Array32) -> None:

@@ -1,5 +1,6 @@
 """Entry points: `control_reset` before the first tick, `control_step` once per 1 ms tick."""
 
+from dbc.machine import Array32, i32, i64, int32
 from firmware_py.kernel.adrc import adrc_reset, adrc_step
 from firmware_py.kernel.command_filter import command_filter_reset, command_filter_step
 from firmware_py.kernel.fixedpoint import clamp
@@ -25,7 +26,6 @@ from firmware_py.kernel.layout import (
     ST_U,
 )
 from firmware_py.kernel.limiter import limiter_reset, limiter_step
-from firmware_py.kernel.machine import Array32, i32, i64, int32
 from firmware_py.kernel.pi import p_step, pi_ff_step, pi_reset, pi_step
 from firmware_py.kernel.scheduled import scheduled_reset, scheduled_step
 from firmware_py.kernel.units import (

@@ -1,5 +1,6 @@
 """Extended state observer (eq. 26 with a linear zone): position, speed, acceleration, total disturbance."""
 
+from dbc.machine import Array32, i64, int32
 from firmware_py.kernel.fal import fal_1_2
 from firmware_py.kernel.fixedpoint import gain, round_shift, sat32, store
 from firmware_py.kernel.layout import (
@@ -17,7 +18,6 @@ from firmware_py.kernel.layout import (
     ST_Z3,
     ST_Z4,
 )
-from firmware_py.kernel.machine import Array32, i64, int32
 
 
 def eso_reset(state: Array32, position: int32) -> None:

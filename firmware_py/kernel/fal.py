@@ -4,8 +4,8 @@ The normalised form is continuous with slope 1 in its linear zone and composes: 
 beta is fal of alpha beta. `e` and `delta` share one LSB, which is the result's.
 """
 
+from dbc.machine import i32, i64, int32
 from firmware_py.kernel.fixedpoint import absolute, isqrt
-from firmware_py.kernel.machine import i32, i64, int32
 
 
 def fal_1_2(e: int32, delta: int32) -> int32:

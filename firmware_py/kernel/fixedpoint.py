@@ -1,7 +1,7 @@
 """Fixed-point arithmetic: one rounding rule (half up), saturation, and an exact integer square root."""
 
+from dbc.machine import Array32, clz, div32, i32, i64, int32, int64, low32
 from firmware_py.kernel.layout import ST_SATURATIONS
-from firmware_py.kernel.machine import Array32, clz, div32, i32, i64, int32, int64, low32
 
 INT32_MAX = 2147483647
 INT32_MIN = -2147483648

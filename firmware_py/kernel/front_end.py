@@ -3,6 +3,7 @@
 The setpoint limiter limits speed and slew and leaves a feasible setpoint untouched, so that nothing lags.
 """
 
+from dbc.machine import Array32, i64, int32
 from firmware_py.kernel.fixedpoint import gain, round_shift, sat32, store
 from firmware_py.kernel.layout import (
     CAL_FRONT_EXTEND,
@@ -15,7 +16,6 @@ from firmware_py.kernel.layout import (
     ST_V2_SMOOTH,
     ST_V3,
 )
-from firmware_py.kernel.machine import Array32, i64, int32
 
 
 def front_end_reset(state: Array32, position: int32) -> None:

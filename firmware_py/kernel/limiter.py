@@ -1,5 +1,6 @@
 """Setpoint limiter: velocity and acceleration limits that leave a feasible reference untouched."""
 
+from dbc.machine import Array32, i32, i64, int32, int64
 from firmware_py.kernel.fixedpoint import absolute, clamp, isqrt, sat32
 from firmware_py.kernel.layout import (
     CAL_LIMITER_BRAKE,
@@ -9,7 +10,6 @@ from firmware_py.kernel.layout import (
     ST_LIMITER_POSITION,
     ST_LIMITER_RATE,
 )
-from firmware_py.kernel.machine import Array32, i32, i64, int32, int64
 
 
 def limiter_reset(state: Array32, position: int32) -> None:

@@ -1,5 +1,6 @@
 """Nonlinear feedback (eq. 27 with consistent units): u = (u0 - z4 - a1n z2 - a2n z3) / b0."""
 
+from dbc.machine import Array32, i64, int32
 from firmware_py.kernel.fal import fal_3_4
 from firmware_py.kernel.fixedpoint import gain, sat32
 from firmware_py.kernel.layout import (
@@ -22,7 +23,6 @@ from firmware_py.kernel.layout import (
     ST_Z3,
     ST_Z4,
 )
-from firmware_py.kernel.machine import Array32, i64, int32
 
 
 def nfcl(calibration: Array32, state: Array32) -> int32:

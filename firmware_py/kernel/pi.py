@@ -3,10 +3,10 @@
 The integral part stops growing while the drive's speed limits the command.
 """
 
+from dbc.machine import Array32, i64, int32
 from firmware_py.kernel.fixedpoint import gain, sat32, store
 from firmware_py.kernel.front_end import feed_forward, front_end_step
 from firmware_py.kernel.layout import CAL_P_KP, CAL_PI_KI, CAL_PI_KP, CAL_U_LIMIT, ST_INTEGRAL
-from firmware_py.kernel.machine import Array32, i64, int32
 
 
 def pi_reset(state: Array32) -> None:

@@ -4,6 +4,7 @@ By eqs 20 to 22 both are proportional to A_A / V1(x) and A_B / V2(x), summed wit
 displacements (b0) as weights, 0.75 and 0.72: one ratio serves both.
 """
 
+from dbc.machine import Array32, div, i64, int32, int64
 from firmware_py.kernel.fixedpoint import clamp, mul_q, sat32
 from firmware_py.kernel.layout import (
     CAL_STIFFNESS_A,
@@ -12,7 +13,6 @@ from firmware_py.kernel.layout import (
     CAL_STIFFNESS_END_B,
     CAL_STROKE,
 )
-from firmware_py.kernel.machine import Array32, div, i64, int32, int64
 
 ONE = 281474976710656  # 1 of the ratios, squared
 RATIO_SHIFT = 24  # LSB of the ratios: 2^-24

@@ -9,6 +9,7 @@ stiffness as a factor, eqs 20 to 22; 1 / kappa is the rod's speed per motor spee
 and the feedback, eq. 27 divided by b0: u = K1 e1 + K2 e2 - K3(x) z3 + kappa v2 - w.
 """
 
+from dbc.machine import Array32, i64, int32
 from firmware_py.kernel.fixedpoint import gain, round_shift, sat32, store
 from firmware_py.kernel.front_end import feed_forward, front_end_step, model_speed
 from firmware_py.kernel.layout import (
@@ -33,7 +34,6 @@ from firmware_py.kernel.layout import (
     ST_Z3,
     ST_Z4,
 )
-from firmware_py.kernel.machine import Array32, i64, int32
 from firmware_py.kernel.schedule import scaled, softness, stiffness
 
 

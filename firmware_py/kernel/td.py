@@ -1,8 +1,8 @@
 """Tracking differentiator (eq. 18) on fhan (eq. 19)."""
 
+from dbc.machine import Array32, div, i64, int32, int64
 from firmware_py.kernel.fixedpoint import absolute, clamp, gain, isqrt, round_shift, store
 from firmware_py.kernel.layout import CAL_TD_D, CAL_TD_H, CAL_TD_R, ST_V1, ST_V2, ST_V3
-from firmware_py.kernel.machine import Array32, div, i64, int32, int64
 
 WORK_LIMIT = 17179869184  # 1 m in 2^-34 m
 

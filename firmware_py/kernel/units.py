@@ -1,7 +1,7 @@
 """Conversions between the bus's units and the kernel's; the factors are correct to 2^-31."""
 
+from dbc.machine import int32
 from firmware_py.kernel.fixedpoint import mul_q, sat32
-from firmware_py.kernel.machine import int32
 
 
 def metres_from_setpoint(setpoint: int32) -> int32:

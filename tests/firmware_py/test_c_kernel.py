@@ -9,11 +9,12 @@ from c_builds import BUILDS, EXPORTED, compiled, output_of
 from kernel_runs import CASES, step_through
 from kernel_segments import Segment, run_compiled, segments
 
+from dbc.contract import Contract
 from firmware_py.c_export.files import export
 from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
-from firmware_py.kernel_check import analyse, kernel_sources
+from firmware_py.kernel_check import MACHINE, analyse, firmware_sources
 from firmware_py.tuning import TUNINGS
 
 HERE = Path(__file__).parent
@@ -25,18 +26,18 @@ def kernel_program(request, tmp_path_factory):
     """The kernel behind a pipe."""
     program = tmp_path_factory.mktemp("c") / f"kernel-{request.param}"
     return compiled(
-        program, [HERE / "kernel_driver.c", EXPORTED / "ddh_controller.c"], *BUILDS[request.param]
+        program, [HERE / "kernel_driver.c", *sorted(EXPORTED.glob("*.c"))], *BUILDS[request.param]
     )
 
 
 def test_what_is_committed_is_what_would_be_exported():
     committed = {path.name: path.read_text() for path in EXPORTED.iterdir()}
-    assert export(chosen_tuning()) == committed, "run make c"
+    assert export(chosen_tuning(), Contract.load()) == committed, "run make c"
 
 
 @pytest.mark.parametrize("name", TUNINGS)
 def test_every_tuning_compiles_without_a_warning(name, tmp_path):
-    for file, text in export(chosen_tuning(name)).items():
+    for file, text in export(chosen_tuning(name), Contract.load()).items():
         (tmp_path / file).write_text(text)
         assert "float" not in text
         assert "double" not in text
@@ -147,14 +148,18 @@ VECTORS = {
     "metres_from_position": [NARROW],
     "velocity_from_speed": [NARROW],
     "speed_from_velocity": [NARROW],
+    "extract": [NARROW, NARROW, [0, 1, 16, 31, 32], [1, 8, 31], [0, 1]],
+    "profile2_crc": [NARROW, NARROW, range(2, 9), [0, 1, 255]],
+    "profile2_is_accepted": [range(256)],
+    "next_state": [range(4), range(32)],
 }
 """Values of each argument of each helper; all their combinations are tried."""
 
 KINDS = {
-    name: (module, signature.parameters)
-    for module, analysed in analyse(kernel_sources())[0].items()
+    name: (module.rpartition(".")[2], signature.parameters)
+    for module, analysed in analyse(firmware_sources())[0].items()
     for name, signature in analysed.functions.items()
-    if module != "machine" and set(signature.parameters) <= {32, 64} and signature.result is not None
+    if module != MACHINE and set(signature.parameters) <= {32, 64} and signature.result is not None
 }
 
 
@@ -164,7 +169,7 @@ def test_every_helper_on_numbers_has_its_vectors():
 
 @pytest.fixture(scope="session", params=BUILDS)
 def helper_program(request, tmp_path_factory):
-    """All helpers behind a pipe: number of the helper and four arguments in, result out; int64."""
+    """All helpers behind a pipe: number of the helper and five arguments in, result out; int64."""
     directory = tmp_path_factory.mktemp("c")
     cases = []
     for number, name in enumerate(VECTORS):
@@ -176,7 +181,7 @@ def helper_program(request, tmp_path_factory):
 #include "{EXPORTED}/ddh_controller.c"
 int main(void)
 {{
-    int64_t words[5];
+    int64_t words[6];
     while (fread(words, sizeof words, 1, stdin) == 1) {{
         int64_t result = 0;
         switch (words[0]) {{
@@ -189,7 +194,7 @@ int main(void)
 }}
 """
     )
-    return compiled(directory / "helpers", [source], *BUILDS[request.param])
+    return compiled(directory / "helpers", [source, EXPORTED / "ddh_calibration.c"], *BUILDS[request.param])
 
 
 def test_helpers_at_the_ends_of_their_ranges(helper_program, kernel_modules):
@@ -201,7 +206,7 @@ def test_helpers_at_the_ends_of_their_ranges(helper_program, kernel_modules):
             {32: kernel_modules["machine"].i32, 64: kernel_modules["machine"].i64}[kind] for kind in kinds
         ]
         for arguments in itertools.product(*values):
-            calls.append((number, *arguments, *(4 - len(arguments)) * (0,)))
+            calls.append((number, *arguments, *(5 - len(arguments)) * (0,)))
             expected.append(
                 int(function(*(make(value) for make, value in zip(makers, arguments, strict=True))))
             )

@@ -9,18 +9,17 @@ from typing import NamedTuple
 import cantools
 import pytest
 
-import firmware_py.mailbox
+import firmware_py.answer
+import firmware_py.contract_words
+import firmware_py.entry_points
 import firmware_py.node
-import firmware_py.state_machine
-import firmware_py.task
 from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING
+from firmware_py.diagnosis import Fault, State
 from firmware_py.kernel.layout import LAW_ADRC, LAW_PI
 from firmware_py.node import EXECUTION_NS, Controller
-from firmware_py.state_machine import State
-from firmware_py.task import Fault
 from firmware_py.tuning import Tuning
 
 CONTRACT = Contract.load()
@@ -572,7 +571,7 @@ def test_limited_periods_are_counted(running):
 # integers only
 
 
-SOURCES = (firmware_py.node, firmware_py.task, firmware_py.mailbox, firmware_py.state_machine)
+SOURCES = (firmware_py.node, firmware_py.answer, firmware_py.entry_points, firmware_py.contract_words)
 
 
 def test_all_it_sends_is_made_of_plain_integers(running):

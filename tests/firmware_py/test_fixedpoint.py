@@ -10,8 +10,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import firmware_py.compiled  # noqa: F401  (makes the kernel callable from jitted code)
+from dbc import machine
 from firmware_py import checked
-from firmware_py.kernel import fal, fixedpoint, machine, td, units
+from firmware_py.kernel import fal, fixedpoint, td, units
 
 INT32 = st.integers(-(2**31), 2**31 - 1)
 INT64 = st.integers(-(2**63), 2**63 - 1)

@@ -7,8 +7,11 @@ import pytest
 from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from dbc.frame import Frame
-from firmware_py import mailbox as rows
+from firmware_py import checked
+from firmware_py import task_layout as at
+from firmware_py.contract_words import expectation
 
+FIRMWARE = checked.load()
 CONTRACT = Contract.load()
 FEEDBACK = CONTRACT.position_feedback
 COMMAND = CONTRACT.controller_command
@@ -16,42 +19,45 @@ SENSOR_OK, SENSOR_BROKEN = 0, 3
 
 
 class Mailbox:
-    """One row of the controller's mailboxes."""
+    """One of the controller's mailboxes, on checked integers."""
 
     def __init__(self, message: MessageCodec[..., Any] = FEEDBACK, **plausible: tuple[int, int]) -> None:
-        self._expected = rows.expectation(message, plausible)
-        (self._row,) = rows.empty(self._expected.reshape(1, -1))
+        self._expected = checked.CheckedArray(expectation(message, plausible))
+        self._words = checked.CheckedArray([0] * at.MAILBOX_SIZE)
+        self._functions = FIRMWARE["mailbox"]
+        self._functions.clear(self._words, 0, self._expected, 0)
 
     def period(self, *frames: Frame | None) -> None:
         """Receive frames, then poll."""
         for frame in frames:
             if frame is not None:
-                rows.receive(self._row, frame.data, frame.dlc)
-        rows.poll(self._row, self._expected)
+                low, high = map(checked.low32, map(checked.i64, (frame.data, frame.data >> 32)))
+                self._functions.take(self._words, 0, frame.dlc, low, high)
+        self._functions.poll(self._words, 0, self._expected, 0)
 
     @property
     def position(self) -> int:
-        return int(self._row[rows.VALUES + 1])
+        return int(self._words[at.VALUES + 1])
 
     @property
     def is_new(self) -> bool:
-        return bool(self._row[rows.IS_NEW])
+        return bool(self._words[at.IS_NEW])
 
     @property
     def stale(self) -> bool:
-        return bool(self._row[rows.STALE])
+        return bool(self._words[at.STALE])
 
     @property
     def corrupt(self) -> bool:
-        return bool(self._row[rows.CORRUPT])
+        return bool(self._words[at.CORRUPT])
 
     @property
     def invalid(self) -> bool:
-        return bool(self._row[rows.INVALID])
+        return bool(self._words[at.INVALID])
 
     @property
     def overruns(self) -> int:
-        return int(self._row[rows.OVERRUNS])
+        return int(self._words[at.OVERRUNS])
 
 
 class Sender:

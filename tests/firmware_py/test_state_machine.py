@@ -4,13 +4,13 @@ from itertools import product
 
 import pytest
 
+from firmware_py.diagnosis import State
 from firmware_py.state_machine import (
     CALIBRATED,
     DRIVE_ENABLED,
     ENABLE,
     FAULT_RESET,
     INPUTS_FRESH,
-    State,
     next_state,
 )
 

@@ -9,8 +9,8 @@ from dbc.contract import Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import PERIOD_NS
+from firmware_py.diagnosis import State
 from firmware_py.node import PHASE_NS, Controller
-from firmware_py.state_machine import State
 from firmware_py.tuning import Tuning
 from hil.bus.wire import Clock, FrameFault, Wire
 from hil.run.inprocess import InprocessRig

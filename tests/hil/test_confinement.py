@@ -9,7 +9,7 @@ from bench_runs import serving
 
 from dbc.frame import EFF_FLAG, ERR_FLAG, Frame
 from dbc.node import NOTHING, Actions
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.bench import Bench
 from hil.bus.messages import to_message
 from hil.bus.wire import FrameFault, Wire

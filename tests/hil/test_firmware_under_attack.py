@@ -12,8 +12,8 @@ from dbc import e2e
 from dbc.contract import Contract
 from dbc.frame import EFF_FLAG, Frame
 from dbc.node import PERIOD_NS
+from firmware_py.diagnosis import State
 from firmware_py.node import PHASE_NS
-from firmware_py.state_machine import State
 from hil.bench import RECOVERY_STEPS
 from hil.bus.wire import FrameFault
 from hil.bus.wire_core import MAX_PORTS

@@ -8,9 +8,9 @@ from bit_by_bit import reference_bits
 from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from dbc.frame import EFF_FLAG
+from firmware_py.diagnosis import State
 from firmware_py.kernel import layout as k
 from firmware_py.node import EXECUTION_NS, PHASE_NS
-from firmware_py.state_machine import State
 from firmware_py.tuning import Tuning
 from hil.closed_loop import play_closed_loop
 from hil.scenario import CONTROLLERS, builtin_names, load_scenario

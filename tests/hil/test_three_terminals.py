@@ -20,7 +20,7 @@ RT_RATIO = "0.03"
 
 SCENARIOS = """
 import pytest
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.references import sine
 
 def test_it_tracks(bench):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.bench import Bench
 from hil.scenario import PERIOD_S, load_scenario
 from hil.signals import Series

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 
 pytestmark = pytest.mark.needs("virtual_time")
 

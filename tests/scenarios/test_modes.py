@@ -12,7 +12,7 @@ from acceptance import (
     undisturbed,
 )
 
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.references import sine
 from plant_sim.drive import State as Drive
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from acceptance import PERIOD_S
 
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.references import sine
 from hil.scenario import TimingLimits
 

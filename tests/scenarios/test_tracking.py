@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from acceptance import play, undisturbed
 
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.references import sine
 
 virtual_time = pytest.mark.needs("virtual_time")

@@ -3,7 +3,7 @@
 import pytest
 from acceptance import MOTOR_LAG_S, PERIOD_S, reaction
 
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from plant_sim.drive import State as Drive
 
 pytestmark = pytest.mark.needs("wire_faults")

@@ -15,7 +15,7 @@ from dbc.e2e import Status
 from dbc.frame import ERR_FLAG
 from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import PERIOD_NS
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil.bench import Bench
 from hil.faults.catalogue import KINDS, fault_of
 from hil.references import sine

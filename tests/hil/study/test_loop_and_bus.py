@@ -10,8 +10,8 @@ from bench_runs import short_scenario
 
 from dbc.contract import Contract
 from firmware_py.chosen_tuning import chosen_tuning
+from firmware_py.diagnosis import State
 from firmware_py.node import PHASE_NS
-from firmware_py.state_machine import State
 from firmware_py.tuning import TUNINGS
 from hil.closed_loop import RUNNING_BEFORE_START_PERIODS, ClosedLoopRun, play_closed_loop
 from hil.measure import result_of, trace_of

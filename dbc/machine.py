@@ -1,6 +1,6 @@
-"""Machine words: the only names whose meaning depends on what runs the kernel.
+"""Machine words: the only names whose meaning depends on what runs restricted Python.
 
-Plain Python leaves widths unchecked; `firmware_py.checked` and `firmware_py.compiled` replace them with
+Plain Python leaves widths unchecked; `firmware_py.checked` and `dbc.restricted` replace them with
 their own. Annotations give the C types.
 """
 
