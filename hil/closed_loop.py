@@ -223,9 +223,14 @@ def play_closed_loop(
     -------
     run : ClosedLoopRun
         Its `reference_m` is the scenario's, not rounded.
+
+    Raises
+    ------
+    ScenarioError
+        If the scenario has faults.
     """
     if scenario.faults:
-        raise ScenarioError(f"{scenario.name} has faults: they need the bus")
+        raise ScenarioError(f"{scenario.name} has faults, which need the bus")
     machine = machine or scenario.machine
     parameters, reference_m = machine.parameters, scenario.reference_m()
     setpoint = setpoint_counts(reference_m)

@@ -9,6 +9,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import can
+
 from dbc.contract import Contract
 from dbc.frame import Frame
 from hil.bus import link
@@ -18,6 +20,7 @@ from hil.bus.opening import bus_settings, open_bus
 from hil.faults.catalogue import fault_of_table, fault_of_text
 from hil.faults.fault import Fault, FaultError, Stage
 from hil.faults.sending import BenchSender
+from hil.run.options import BenchError
 
 EPILOG = """On hilbus: a lock-step run with `--channel` takes every fault and notes the bus time in
 result.json; `hil bus` takes those of the wire and, like any other interface, those of sensor and machine.
@@ -92,7 +95,10 @@ def _send(faults: list[Fault], arguments: argparse.Namespace) -> None:
     with open_bus(*bus_settings(arguments.interface, arguments.channel, arguments.bitrate)) as bus:
 
         def send(frame: Frame) -> None:
-            bus.send(to_message(0, frame, arguments.channel))
+            try:
+                bus.send(to_message(0, frame, arguments.channel))
+            except can.CanError as error:
+                raise BenchError(f"cannot send on {bus.channel_info}: {error}") from error
 
         def at(time_ns: int, action: Action) -> None:
             todo.append((time_ns, action))

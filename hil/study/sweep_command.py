@@ -111,6 +111,8 @@ def _sweep_of(arguments: argparse.Namespace) -> "Sweep":
     base = scenarios[0].machine
     if any(scenario.machine != base for scenario in scenarios):
         raise BenchError("the scenarios are played on different machines: sweep them one at a time")
+    if failing := [scenario.name for scenario in scenarios if scenario.faults]:
+        raise BenchError(f"{failing[0]} has faults, which need the bus: a sweep is played without one")
     if arguments.samples < 1 or arguments.seed < 0:
         raise BenchError("--samples must be 1 or more, --seed 0 or more")
     machines = (

@@ -259,6 +259,7 @@ def test_the_list_names_every_scenario(capsys):
         ["sweep", "--help"],
         ["replay", "--help"],
         ["bus", "--help"],
+        ["inject", "--help"],
         ["list", "--help"],
     ],
     ids=" ".join,

@@ -17,7 +17,7 @@ from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import PERIOD_NS
 from firmware_py.diagnosis import State
 from hil.bench import Bench
-from hil.faults.catalogue import KINDS, fault_of
+from hil.faults.catalogue import GROUPS, KINDS, fault_of
 from hil.references import sine
 from hil.run.inprocess import InprocessRig
 from hil.run.options import RigOptions
@@ -290,7 +290,47 @@ def random_signal(bench):
     assert not_ok(bench, "PositionSetpoint") == {}
 
 
-# of sensor and machine: the plant is told, also when it is over; tests/plant_sim shows what it makes of it
+# of sensor and machine: the plant is told, also when it is over, and does not go on as it would have;
+# tests/plant_sim says how
+
+
+@pytest.mark.parametrize("kind", [kind.kind for group in ("sensor", "machine") for kind in GROUPS[group]])
+def test_what_the_plant_is_told_makes_a_difference_from_then_on(rig, kind):
+    harmed, unharmed = ready(Bench(rig)), ready(Bench(rig))
+    for bench in (harmed, unharmed):
+        bench.run(0.5)
+    harmed.inject(kind, at_s=0.01, **STRONG.get(kind, {}))
+    for bench in (harmed, unharmed):
+        bench.run(0.1)
+    rows = zip(shown_by(harmed), shown_by(unharmed), strict=True)
+    differs = np.array([not np.array_equal(*pair, equal_nan=True) for pair in rows])
+    assert 510 <= np.argmax(differs) <= 520
+    assert differs.sum() > 50
+
+
+STRONG = {
+    "sensor_bias": {"bias_m": 0.001},
+    "sensor_drift": {"drift_m_s": 0.01},
+    "sensor_noise": {"rms_m": 1e-5},
+    "sensor_status": {"status": 1},
+    "precharge_loss": {"factor": 0.5},
+    "leak": {"factor": 3.0},
+    "efficiency_loss": {"factor": 0.5},
+    "entrained_air": {"factor": 0.1},
+    "motor_speed_loss": {"factor": 0.05},
+    "motor_acceleration_loss": {"factor": 0.01},
+    "load_step": {"force_n": -500.0},
+    "load_impulse": {"impulse_n_s": 5.0},
+}
+
+
+def shown_by(bench: Bench) -> np.ndarray:
+    """Position and pressures of the machine, and the PositionFeedback of the period, NaN without one."""
+    feedback = np.full(len(bench.trace["time_s"]), np.nan)
+    for end_ns, data in frames(bench, "PositionFeedback"):
+        feedback[end_ns // PERIOD_NS] = data >> 8
+    names = ("position_m", "pressure_a_bar", "pressure_b_bar")
+    return np.column_stack([feedback, *(bench.trace[name] for name in names)])
 
 
 def told(bench: Bench) -> list[tuple[int, int, int, int]]:

@@ -10,6 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import can
+import matplotlib
 import numpy as np
 import pytest
 from bench_runs import SAFETY_NET_S, background, serving, sha256, short_scenario, wait_until
@@ -17,18 +18,21 @@ from bit_by_bit import reference_bits
 
 from dbc.contract import Contract
 from dbc.messages import BenchCommand, BenchFault
+from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.node import PHASE_NS
 from hil import cli
 from hil.bench import Bench
 from hil.bus import link
+from hil.closed_loop import play_closed_loop
 from hil.faults.catalogue import KINDS, fault_of_text
 from hil.faults.fault import FaultError
 from hil.inject_command import take_faults
+from hil.report import draw
 from hil.run.inprocess import InprocessRig, run_inprocess
 from hil.run.lockstep import run_lockstep
 from hil.run.options import Recording, RigOptions, RunOptions
 from hil.run.realtime_rig import RealtimeRig
-from hil.scenario import Scenario, load_scenario
+from hil.scenario import Scenario, ScenarioError, load_scenario
 
 CONTRACT = Contract.load()
 ALL_KINDS = Path(__file__).parent / "all_kinds.toml"
@@ -109,6 +113,15 @@ def test_file_command_line_and_test_play_the_same(tmp_path, rig, capsys):
     assert times_s == pytest.approx([0.05, 0.06, 0.0702, 0.1])
 
 
+def test_the_picture_names_them(tmp_path, rig):
+    bench = Bench(rig)
+    bench.inject("load_step", force_n=-500, at_s=0.01)
+    bench.run(0.02)
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        draw(tmp_path / "picture.svg", bench.result("x"), bench.trace)
+    assert ">load_step</text>" in (tmp_path / "picture.svg").read_text()
+
+
 def test_a_fault_begins_at_its_nanosecond(rig):
     bench = Bench(rig)
     bench.run(0.01)
@@ -146,6 +159,13 @@ def test_too_many_faults_at_a_time_end_the_run_with_one_line(tmp_path, capsys):
     assert line == "hil: at bus time 0.200000 s: there is room for 64 faults at a time"
 
 
+def test_a_sweep_refuses_a_scenario_with_faults(capsys):
+    assert cli.main(["sweep", str(ALL_KINDS)]) == 2
+    assert "all_kinds has faults, which need the bus" in capsys.readouterr().err
+    with pytest.raises(ScenarioError, match="all_kinds has faults, which need the bus"):
+        play_closed_loop(load_scenario(str(ALL_KINDS)), chosen_tuning().calibration)
+
+
 # real time
 
 
@@ -157,7 +177,7 @@ def test_in_real_time_what_needs_a_simulated_wire_is_refused(tmp_path, capsys):
 
 
 def test_in_real_time_sensor_and_load_do_what_they_are_told(tmp_path):
-    options = RigOptions(record_directory=tmp_path, rt_ratio=Fraction(1, 20))
+    options = RigOptions(record_directory=tmp_path, rt_ratio=Fraction(1, 5))
     with RealtimeRig(options) as rig:
         bench = Bench(rig)
         with pytest.raises(FaultError, match="drop needs virtual time"):
@@ -261,6 +281,16 @@ def test_hil_inject_on_another_interface(capsys):
         assert [unpack(int.from_bytes(message.data, "little")).force for message in received] == [-5, -2, 3]
         assert cli.main([*where, "bus_off,node=plant"]) == 2
     assert "bus_off needs a simulated wire: virtual has none" in capsys.readouterr().err
+
+
+def test_an_interrupted_fault_is_ended_at_once(monkeypatch):
+    def interrupt(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hil.inject_command.time.sleep", interrupt)
+    with can.Bus(interface="virtual", channel="shop floor") as plant:
+        assert cli.main(["inject", "shop floor", "-i", "virtual", "sensor_stuck,duration_s=1000"]) == 0
+        assert [control_in(plant)[2] for _ in range(2)] == [1_000_000, 0]
 
 
 def control_in(bus: can.BusABC) -> tuple[int, int, int]:
