@@ -103,7 +103,9 @@ def _parser() -> argparse.ArgumentParser:
         usage="hil run SCENARIO [options]   (name as in `hil list`, or .toml file)",
         epilog=EXIT_CODES,
         formatter_class=_OneLineEach,
+        add_help=False,
     )
+    run.add_argument("-h", "--help", action="help", help=argparse.SUPPRESS)
     run.set_defaults(command=_run)
     run.add_argument("scenario", help=argparse.SUPPRESS)
     laws = " ".join(CONTROLLERS)
