@@ -343,6 +343,7 @@ class Wire:
             earlier = self.log[self.log[:, at.LOG_HEAD] & 0xFFFF_FFFF == can_id]
             argument = int(earlier[-1, at.LOG_DATA]) if len(earlier) else 0
         self._faults[free[0]] = can_id, fault, _signed(argument), count
+        self._core[at.FAULTS] = max(self._core[at.FAULTS], free[0] + 1)
 
     def disturb(self, bit_error_rate: float, duration_ns: int, seed: int = 0) -> None:
         """Let every bit be bad with a probability, from now on; each bad one destroys the frame it is in.

@@ -73,8 +73,9 @@ FLAGS_SHIFT = 40
     BABBLE_GAP,  # from the end of a babbled frame's intermission to the next frame, ns
     BABBLE_UNTIL,  # bus time from which no further one is handed over, ns
     DATA_BIT_RATE,
-) = range(25)
-CORE_SIZE = 25
+    FAULTS,  # rows in use
+) = range(26)
+CORE_SIZE = 26
 
 MAX_PORTS = 48
 BABBLER = 1 << 30
@@ -232,7 +233,7 @@ def _suspended_until(core, ports, sender):  # type: ignore[no-untyped-def]
 @register_jitable
 def _bad_bit(core, faults, can_id, bits):  # type: ignore[no-untyped-def]
     """Return at which bit the frame that begins is destroyed, -1 if it is not."""
-    for number in range(faults.shape[0]):
+    for number in range(core[FAULTS]):
         if faults[number, FAULT_COUNT] == 0 or faults[number, FAULT_ID] != can_id:
             continue
         if faults[number, FAULT_KIND] == DESTROY:
@@ -398,7 +399,7 @@ def _hand_over(core, ports, queue, faults, out_of_band, sender, ready_ns, head, 
     if head >> FLAGS_SHIFT:
         _enqueue(core, queue, max(ready_ns, core[NOW]), sender, head, data)
         return
-    for number in range(faults.shape[0]):
+    for number in range(core[FAULTS]):
         if faults[number, FAULT_COUNT] == 0 or faults[number, FAULT_ID] != can_id:
             continue
         fault = faults[number]

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ import can
 
 from dbc.contract import ContractError
 from dbc.node import NOTHING, Node
-from dbc.packet import answers_of, pack_actions_into
+from dbc.packet import FRAME, answers_of, pack_actions_into
 from dbc.record import Record
 from hil.bus import link
 from hil.bus.hilbus import HilBus
@@ -106,7 +107,7 @@ def serve(node: RecordingNode, connection: socket.socket, channel: str, record: 
     """
     packet, answer = memoryview(bytearray(link.MAX_PACKET)), bytearray(link.MAX_PACKET)
     view, receive, send = memoryview(answer), connection.recv_into, connection.send
-    answer_to = answers_of(node)
+    answer_to, nothing_into = answers_of(node), partial(pack_actions_into, actions=NOTHING)
     with connection:
         while True:
             try:
@@ -118,14 +119,16 @@ def serve(node: RecordingNode, connection: socket.socket, channel: str, record: 
                     f"the hub of channel {channel!r} ended without a stop: is the bench still there?"
                 )
             kind = packet[0]  # the least significant byte
+            if kind <= FRAME:
+                send(view[: answer_to(packet[:length], answer) or nothing_into(answer)])
+                continue
             if kind == link.STOP:
                 return
             if kind == link.SAVE and record is not None:
                 node.record.save(record / f"{node.name}.npz")
             elif kind == link.FORGET:
                 node.record.clear()
-            length = answer_to(packet[:length], answer) or pack_actions_into(answer, NOTHING)
-            send(view[:length])
+            send(view[: nothing_into(answer)])
 
 
 def _attach(channel: str, node: Node) -> tuple[socket.socket, dict[str, Any]]:
