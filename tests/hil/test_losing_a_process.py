@@ -117,6 +117,7 @@ def test_after_a_loss_the_others_play_on_for_a_tenth_of_a_second_of_bus_time():
     assert AFTERMATH_NS == 100 * PERIOD_NS
 
     lost_rig = SimpleNamespace(
+        contract=CONTRACT,
         options=RigOptions(record_directory=Path()),
         give_up=lambda: None,
         hub=SimpleNamespace(
