@@ -149,8 +149,9 @@ class Participant:
 
     def _skip_to(self, log: np.ndarray, position: int) -> None:
         if position > self.position:
-            lost = log[self.position : position, LOG_SENDER]
-            self.dropped += int(np.count_nonzero(lost != self.sender))
+            lost = log[self.position : position]
+            of_its_kind = self._fd | (lost[:, LOG_HEAD] >> FLAGS_SHIFT == 0)
+            self.dropped += int(np.count_nonzero(of_its_kind & (lost[:, LOG_SENDER] != self.sender)))
             self.position = position
 
 

@@ -45,9 +45,7 @@ def pack_frame(frame: Frame) -> bytes:
     return _FRAME.pack(*frame)
 
 
-def _read_frame(packet: bytes) -> Frame:
-    if len(packet) != _FD_FRAME.size:
-        return Frame(*_FRAME.unpack(packet))
+def _read_fd_frame(packet: bytes) -> Frame:
     can_id, dlc, flags, data = _FD_FRAME.unpack(packet)
     return Frame(can_id | flags << 32 | FD_FLAG, dlc, int.from_bytes(data, "little"))
 
@@ -60,12 +58,16 @@ def unpack_frame(packet: bytes) -> Frame:
     ValueError
         If it is not a data frame.
     """
-    if len(packet) not in (_FRAME.size, _FD_FRAME.size):
+    if len(packet) == _FRAME.size:
+        can_id, dlc, data = _FRAME.unpack(packet)
+        word, known = can_id, dlc <= 8
+    elif len(packet) == _FD_FRAME.size:
+        can_id, dlc, data = _read_fd_frame(packet)
+        word, known = can_id & 0xFFFF_FFFF, dlc in CAN_FD_DLC and can_id < FD_FLAG << 1
+    else:
         raise ValueError(f"{len(packet)} bytes are no frame")
-    can_id, dlc, data = _read_frame(packet)
-    word, flags = can_id & 0xFFFF_FFFF, can_id >> 32
     highest = EFF_FLAG | 0x1FFF_FFFF if word & EFF_FLAG else 0x7FF
-    if dlc not in (CAN_FD_DLC if flags else range(9)) or word > highest or flags > 7:
+    if not known or word > highest:
         raise ValueError(f"id {word:#x} with {dlc} bytes is no data frame")
     return Frame(can_id, dlc, data & ((1 << 8 * dlc) - 1))
 
@@ -77,8 +79,11 @@ def pack_timed(time_ns: int, frame: Frame) -> bytes:
 
 def unpack_timed(packet: bytes) -> tuple[int, Frame]:
     """Return bus time in ns and frame."""
+    if len(packet) == TIMED_FRAME_BYTES:
+        time_ns, can_id, dlc, data = _TIMED_FRAME.unpack(packet)
+        return time_ns, Frame(can_id, dlc, data)
     (time_ns,) = _TIME.unpack_from(packet)
-    return time_ns, _read_frame(packet[_TIME.size :])
+    return time_ns, _read_fd_frame(packet[_TIME.size :])
 
 
 @runtime_checkable

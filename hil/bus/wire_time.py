@@ -204,17 +204,25 @@ def traffic_bits(traffic: NDArray[Any]) -> NDArray[np.int64]:
     ndarray of int64, shape (frames, 2)
         Bits at the nominal rate and at the data rate.
     """
-    lengths = [_logged_bits(*frame) for _, *frame in traffic.tolist()]
-    return np.array(lengths, np.int64).reshape(-1, 2)
+    lengths: NDArray[np.int64] = _logged_bits(np.ascontiguousarray(traffic, np.uint64).view(np.int64))
+    return lengths
 
 
-def _logged_bits(can_id: int, dlc: int, data: int) -> tuple[int, int]:
-    if can_id & ERR_FLAG:
-        nominal = data >> 8 * ERROR_BITS_BYTE & 0xFF | (data >> 8 * ERROR_MORE_BITS_BYTE & 0xFF) << 8
-        return nominal + INTERMISSION_BITS, data & 0xFFFF
-    if can_id & FD_FLAG:
-        return data & LENGTH_MASK, data >> FAST_SHIFT & LENGTH_MASK
-    return classic_bits(can_id, dlc, data), 0
+@njit("int64[:,::1](int64[:,::1])", depends=("dbc.frame",))
+def _logged_bits(traffic):  # type: ignore[no-untyped-def]
+    lengths = np.zeros((traffic.shape[0], 2), np.int64)
+    for row in range(traffic.shape[0]):
+        can_id, dlc, data = traffic[row, 1], traffic[row, 2], traffic[row, 3]
+        if can_id & ERR_FLAG:
+            high, low = data >> 8 * ERROR_MORE_BITS_BYTE & 0xFF, data >> 8 * ERROR_BITS_BYTE & 0xFF
+            lengths[row, 0] = (high << 8 | low) + INTERMISSION_BITS
+            lengths[row, 1] = data & 0xFFFF
+        elif can_id & FD_FLAG:
+            lengths[row, 0] = data & LENGTH_MASK
+            lengths[row, 1] = data >> FAST_SHIFT & LENGTH_MASK
+        else:
+            lengths[row, 0] = classic_bits(can_id, dlc, np.uint64(data))
+    return lengths
 
 
 def frame_bits(message: can.Message) -> int:

@@ -26,7 +26,8 @@ def add_command(commands: Any) -> None:
         help="worst-case response time of every message of the DBC",
         description="Worst-case response times (Davis et al. 2007) of the messages of a DBC. "
         "Each node sends its frames by priority; a message with a cycle time is taken to come no oftener, "
-        "below one without there is no bound. The bench channel is left out.",
+        "below one without there is no bound. The bench channel is left out. The analysis is for classic "
+        "frames: a DBC with a CAN FD message is refused.",
         epilog="exit codes: 0 every message meets its deadline at every bit rate asked for; 1 one does not; "
         "2 wrong input",
     )
@@ -63,7 +64,9 @@ def traffic_of(dbc: Path, jitter_ns: int = 0) -> tuple[list[Traffic], int]:
         if "BenchChannel" in attributes and attributes["BenchChannel"].value:
             continue
         if message.is_fd or message.length > MAX_CLASSIC_DLC:
-            raise ContractError(f"{dbc}: {message.name} is no classic CAN frame: the analysis is for those")
+            raise ContractError(
+                f"{dbc}: {message.name} is no classic CAN frame: the analysis is for those, leave it out"
+            )
         can_id = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
         period_ns = message.cycle_time * NS_PER_MS if message.cycle_time else None
         bits = worst_case_bits(can_id, message.length)

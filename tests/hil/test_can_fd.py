@@ -2,6 +2,8 @@
 
 import json
 import re
+import socket
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
@@ -21,6 +23,7 @@ from firmware_py.state_machine import State
 from hil import cli
 from hil.bench import Bench
 from hil.bus import link
+from hil.bus.hub import Hub, Participant
 from hil.bus.messages import to_frame, to_message
 from hil.bus.wire import FrameFault, Wire
 from hil.bus.wire_core import MAX_PORTS
@@ -40,6 +43,7 @@ HEADER_BITS, TAIL_BITS, FAST_BITS = 17, 12, 97
 FD = Frame(0x555 | FD_FLAG | BRS_FLAG, 8, 0x5555_5555_5555_5555)
 CLASSIC = Frame(0x555, 8, 0x5555_5555_5555_5555)
 CLASSIC_BITS = 112
+LONG = Frame(0x7FF | FD_FLAG | BRS_FLAG, 64, int.from_bytes(bytes(range(64)), "little"))
 ERROR_BITS, IFS_BITS = 6 + 8, 3
 
 
@@ -396,6 +400,41 @@ def test_payloads_that_all_have_read_are_forgotten(wire):
     assert [wire.logged(row)[1].data for row in range(len(wire.log))] == list(range(done - 1, 10))
 
 
+NO_NODES: frozenset[str] = frozenset()
+
+
+def test_in_virtual_time_it_is_an_injection_and_listeners_hear_it_at_its_bus_time(wire):
+    with Hub(wire, "virtual", expected=NO_NODES) as hub:
+        with ThreadPoolExecutor() as pool:
+            opening = [pool.submit(can.Bus, interface="hilbus", channel="virtual", fd=True) for _ in range(2)]
+            wait_until(lambda: hub.service(0.01) or all(bus.done() for bus in opening), "both are attached")
+            sender, listener = (bus.result() for bus in opening)
+        with sender, listener:
+            wire.run(1_000_000)
+            sender.send(to_message(0, LONG))
+            wait_until(lambda: hub.service(0.01) or hub.injections, "it is taken")
+            wire.run(2_000_000)
+            hub.service()
+            heard = listener.recv(SAFETY_NET_S)
+    assert hub.injections == [(1_000_000, LONG)]
+    nominal, fast = reference_length(LONG)
+    end_ns = 1_000_000 + (nominal - IFS_BITS) * NOMINAL_NS + fast * FAST_NS
+    assert (to_frame(heard), round(heard.timestamp * 1e9)) == (LONG, end_ns)
+    assert json.loads(json.dumps(hub.injections)) == [[1_000_000, [*LONG]]]
+
+
+@pytest.mark.parametrize(("fd", "dropped"), [(False, 1), (True, 3)])
+def test_what_a_slow_listener_loses_is_counted_if_it_is_for_it(wire, fd, dropped):
+    for frame in (FD, CLASSIC, FD):
+        wire.send(PROGRAM, 0, frame)
+    wire.run(10**7)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        listener = Participant(ours, "slow", PROGRAM + 1, 0, fd)
+        listener.give_up(wire.log)
+    assert listener.dropped == dropped
+
+
 # the page about it
 
 PAGE = Path(__file__).parents[2] / "docs" / "bus.md"
@@ -500,9 +539,6 @@ def bench_with(tmp_path: Path, *frames: Frame, data_bit_rate: int = 5_000_000) -
         bench.run(0.1)
         bench.end()
     return bench
-
-
-LONG = Frame(0x7FF | FD_FLAG | BRS_FLAG, 64, int.from_bytes(bytes(range(64)), "little"))
 
 
 def test_a_run_s_hash_has_every_byte_of_it(tmp_path):

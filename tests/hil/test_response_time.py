@@ -213,10 +213,11 @@ def test_the_command_prints_a_verdict_for_every_message(capsys):
     assert "500 kbit/s" in said
 
 
-def test_a_missed_deadline_is_an_exit_code(capsys):
-    assert main(["rta", "-b", "250000"]) == 1
-    said = capsys.readouterr().out
-    assert "missed" in said
+@pytest.mark.parametrize(("bit_rate", "met"), [(125_000, 0), (250_000, 1), (500_000, 8), (1_000_000, 8)])
+def test_at_every_usual_bit_rate_each_message_is_met_or_missed(capsys, bit_rate, met):
+    assert main(["rta", "-b", str(bit_rate)]) == (met < 8), "a missed deadline is an exit code"
+    verdicts = [line.split()[-1] for line in capsys.readouterr().out.splitlines() if " 0x" in line]
+    assert verdicts == ["met"] * met + ["missed"] * (8 - met)
 
 
 def test_the_figures_can_be_had_as_json(capsys):
@@ -235,6 +236,7 @@ def test_the_figures_can_be_had_as_json(capsys):
         (["--dbc", "nowhere.dbc"], "nowhere.dbc: cannot be read"),
         (["--dbc", "twins.dbc"], "twins.dbc: one and other have one identifier 0x100"),
         (["--dbc", "stopped.dbc"], "bit rate 0 is not from"),
+        (["--dbc", "fd.dbc"], "fd.dbc: one is no classic CAN frame: the analysis is for those, leave it out"),
         (["--jitter", "-1"], "--jitter is -1.0, must be from 0"),
     ],
 )
@@ -245,6 +247,8 @@ def test_wrong_input_is_refused_with_one_line(capsys, tmp_path, monkeypatch, arg
     (tmp_path / "twins.dbc").write_text(f'VERSION ""\nBU_: N\n{frames}{cycle}')
     stopped = 'BA_DEF_ "Baudrate" INT 0 1000000;\nBA_DEF_DEF_ "Baudrate" 0;\nBA_ "Baudrate" 0;\n'
     (tmp_path / "stopped.dbc").write_text(f'VERSION ""\nBU_: N\nBO_ 256 one: 8 N\n\n{cycle}{stopped}')
+    fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","StandardCAN_FD";\nBA_ "VFrameFormat" BO_ 256 1;\n'
+    (tmp_path / "fd.dbc").write_text(f'VERSION ""\nBU_: N\nBO_ 256 one: 8 N\n\n{cycle}{fd}')
     assert main(["rta", *arguments]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
