@@ -36,6 +36,9 @@ figures: $(READY)  ## rewrite the figures in README from a new evaluation
 c: $(READY)  ## rewrite the exported C in firmware_py/c
 	$(BIN)/python -m firmware_py.c_export firmware_py/c
 
+faults: $(READY)  ## play the fault matrix; rewrite it in docs/fault_matrix.md
+	$(BIN)/python tests/tools/fault_figures.py
+
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'

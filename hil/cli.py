@@ -47,8 +47,16 @@ from hil.run.rig import play
 from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, controller_of, load_scenario, too_late
-from hil.study import replay_command, reproduce, rta_command, sweep_command, tune_command
+from hil.study import (
+    faults_command,
+    replay_command,
+    reproduce,
+    rta_command,
+    sweep_command,
+    tune_command,
+)
 from hil.study.box import BoxError
+from hil.study.fault_matrix import MatrixError
 from hil.supervisor import BRING_UP_S
 from plant_sim.parameters import ParameterError
 
@@ -64,6 +72,7 @@ REFUSALS = (
     ContractError,
     FaultError,
     LinkError,
+    MatrixError,
     ParameterError,
     ScenarioError,
 )
@@ -148,6 +157,7 @@ def _parser() -> argparse.ArgumentParser:
 
     sweep_command.add_command(commands)
     tune_command.add_command(commands)
+    faults_command.add_command(commands)
 
     bus = commands.add_parser("bus", help="serve an embedded bus in wall time")
     bus.set_defaults(command=_bus)

@@ -90,11 +90,11 @@ def in_readme(block: str) -> str:
     return README.read_text(encoding="utf-8").split(begin)[1].split(end)[0]
 
 
-def write_to_readme(block: str, content: str) -> None:
-    """Replace the block of that name."""
+def write_to_readme(block: str, content: str, page: Path = README) -> None:
+    """Replace the block of that name, in README or on another page."""
     begin, end = _marks(block)
-    before, rest = README.read_text(encoding="utf-8").split(begin)
-    README.write_text(before + begin + content + end + rest.split(end)[1], encoding="utf-8")
+    before, rest = page.read_text(encoding="utf-8").split(begin)
+    page.write_text(before + begin + content + end + rest.split(end)[1], encoding="utf-8")
 
 
 def _marks(block: str) -> tuple[str, str]:

@@ -1,0 +1,24 @@
+"""Play the fault matrix and write its tables into ``docs/fault_matrix.md`` (``make faults``)."""
+
+import json
+import sys
+
+from readme_figures import ROOT, write_to_readme
+
+from hil import cli
+from hil.study.fault_pages import markdown
+
+PAGE = ROOT / "docs" / "fault_matrix.md"
+
+
+def main() -> int:
+    """Return the exit code of ``hil faults``."""
+    out = ROOT / "out" / "faults"
+    code = cli.main(["faults", "--out", str(out)])
+    matrix = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
+    write_to_readme("matrix", markdown(matrix), PAGE)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
