@@ -1401,12 +1401,6 @@ static const int32_t DDH_CONTRACT[DDH_CONTRACT_SIZE] = {
     16, 32, 32, -1610678271, 8, 0, 8
 };
 
-/* A 32-bit word in two's complement. */
-static int32_t signed_word(uint32_t word)
-{
-    return (word < 0x80000000U) ? (int32_t)word : ((int32_t)(word - 0x80000000U) - 2147483647 - 1);
-}
-
 void ddh_start(ddh_controller *controller)
 {
     power_on(DDH_CONTRACT, controller->mailboxes, controller->task, controller->state, controller->io,

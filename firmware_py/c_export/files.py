@@ -77,12 +77,6 @@ static int32_t clz(int64_t value)
 """
 
 ENTRY_POINTS = """\
-/* A 32-bit word in two's complement. */
-static int32_t signed_word(uint32_t word)
-{
-    return (word < 0x80000000U) ? (int32_t)word : ((int32_t)(word - 0x80000000U) - 2147483647 - 1);
-}
-
 void ddh_start(ddh_controller *controller)
 {
     power_on(DDH_CONTRACT, controller->mailboxes, controller->task, controller->state, controller->io,

@@ -19,9 +19,9 @@ BUILDS = {
 """Compiler options of each build; the sanitized one ends at the first undefined operation."""
 
 
-def compiled(program: Path, sources: Iterable[Path], *options: str) -> Path:
+def compiled(program: Path, sources: Iterable[Path], *options: str, include: Path = EXPORTED) -> Path:
     """Compile and link; any warning is an error."""
-    command = ["gcc", *STRICT, *options, f"-I{EXPORTED}", "-o", str(program), *map(str, sources)]
+    command = ["gcc", *STRICT, *options, f"-I{include}", "-o", str(program), *map(str, sources)]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     return program
