@@ -1,5 +1,10 @@
-"""Numba compilation whose file cache sees changes in every source a function is built from."""
+"""Numba compilation whose file cache sees changes in every source a function is built from.
 
+With NUMBA_DISABLE_JIT=1 in the environment the same functions run interpreted: slow, for coverage, mutation
+and debuggers.
+"""
+
+import functools
 import hashlib
 import importlib.util
 from collections.abc import Callable
@@ -7,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 
 
 def source_digest(*modules: str) -> str:
@@ -38,6 +44,8 @@ def njit(signature: str, *, depends: tuple[str, ...] = ()) -> Callable[[Callable
     """
 
     def compile_function(function: Callable[..., Any]) -> Any:
+        if numba.config.DISABLE_JIT:
+            return _interpreted(function)
         dispatcher: Any = numba.njit(error_model="numpy")(function)
         dispatcher.enable_caching()
         # private, but stable since numba 0.20; tests/dbc/test_jit.py fails if it stops working
@@ -54,6 +62,27 @@ def entry_point(function: Any) -> Callable[..., Any]:
 
     It skips numba's choice among signatures, which costs as much again as the call; there is only one.
     """
+    if numba.config.DISABLE_JIT:
+        interpreted: Callable[..., Any] = function
+        return interpreted
     (compiled,) = function.overloads.values()
     call: Callable[..., Any] = compiled.entry_point
     return call
+
+
+def _interpreted(function: Callable[..., Any]) -> Any:
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        return _plain(function(*map(_plain, arguments)))
+
+    call.py_func = function  # type: ignore[attr-defined]
+    return call
+
+
+def _plain(argument: Any) -> Any:
+    """Integers of any width as int, int32 arrays as what loads and stores int."""
+    if isinstance(argument, np.integer):
+        return int(argument)
+    if isinstance(argument, np.ndarray) and argument.dtype == np.int32:
+        return memoryview(argument)
+    return argument

@@ -31,6 +31,10 @@ PROTECTED = (
 )
 BENCH_IDS = {CONTRACT.bench_control.can_id, CONTRACT.bench_load.can_id}
 HIGHEST_COUNT = 3000 * 4  # the drive's 3000 rpm in 0.25 rpm
+HIGHEST_RAD_S = 100 * np.pi
+STANDSTILL_RAD_S = 1.0
+COASTING_PERIODS = 3 + 95  # missed commands, then the ramp and the motor's lag behind it
+PLANT, CONTROLLER = 1, 2  # ports on the wire
 CONTROLWORDS = {0x00, 0x02, 0x06, 0x07, 0x0F, 0x80}
 OPERATION_ENABLED = 0x27
 SLICE_PERIODS = 20
@@ -43,12 +47,17 @@ class Attacker:
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
-        self._attacks = (self.random, self.mutated, self.replayed, self.forged)
+        self._attacks = (self.random, self.mutated, self.replayed, self.forged, self.mistaken)
 
     def frames(self, heard: list[Frame], count: int) -> list[Frame]:
         """Return the next `count` frames; `heard` are the newest on the bus."""
-        choice = self._rng.integers(len(self._attacks), size=count).tolist()
-        return [self._attacks[number](heard) for number in choice]
+        frames: list[Frame] = []
+        while len(frames) < count:
+            if self._rng.random() < 0.05:
+                frames += self.reordered(heard)
+            else:
+                frames.append(self._attacks[int(self._rng.integers(len(self._attacks)))](heard))
+        return frames[:count]
 
     def random(self, heard: list[Frame]) -> Frame:
         dlc = int(self._rng.integers(9))
@@ -69,6 +78,20 @@ class Attacker:
 
     def replayed(self, heard: list[Frame]) -> Frame:
         return heard[int(self._rng.integers(len(heard)))]
+
+    def reordered(self, heard: list[Frame]) -> list[Frame]:
+        """Return the newest frames of one message in another order."""
+        can_id = self.replayed(heard).can_id
+        newest = [frame for frame in heard if frame.can_id == can_id][-4:]
+        return [newest[place] for place in self._rng.permutation(len(newest))]
+
+    def mistaken(self, heard: list[Frame]) -> Frame:
+        """Return a forged frame of another length, or whose identifier only looks like that of a message."""
+        can_id, dlc, data = self.forged(heard)
+        if self._rng.random() < 0.5:
+            return Frame(EFF_FLAG | can_id << int(self._rng.choice([0, 18])), dlc, data)
+        other = int(self._rng.choice([length for length in range(9) if length != dlc]))
+        return Frame(can_id, other, data & (1 << 8 * other) - 1)
 
     def forged(self, heard: list[Frame]) -> Frame:
         """Return a frame whose CRC is right: nothing but its content and counter can give it away."""
@@ -102,6 +125,12 @@ def newest_before(times_ns: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return stamps[np.searchsorted(stamps, times_ns, side="right") - 1]
 
 
+def sent_by(port: int, message, log: np.ndarray) -> list:
+    """Return what a node put on the bus of a message."""
+    own = log[(log[:, 1] & 0xFFFF_FFFF == message.can_id) & (log[:, 3] == port)]
+    return [message.unpack(int(data) & (1 << 64) - 1) for data in own[:, 2]]
+
+
 def attacked_run(tmp_path: Path, seed: int, count: int, enabled: bool):
     """Return recording and log of a run with `count` hostile frames in bursts; own ones get lost."""
     attacker, rng, left = Attacker(seed), np.random.default_rng(seed + 1), count
@@ -127,8 +156,12 @@ def attacked_run(tmp_path: Path, seed: int, count: int, enabled: bool):
                 wire.send(ATTACKER, wire.now_ns + ready_ns, frame)
             left -= burst
             if rng.random() < 0.05:
-                silenced = PROTECTED[int(rng.integers(len(PROTECTED)))]
-                wire.spoil(silenced.can_id, FrameFault.DROP, 0, int(rng.integers(1, 9)))
+                victim = PROTECTED[int(rng.integers(len(PROTECTED)))]
+                wire.spoil(victim.can_id, FrameFault.DROP, 0, int(rng.integers(1, 9)))
+            if rng.random() < 0.05:  # overtaken by the next one of its kind
+                victim = PROTECTED[int(rng.integers(len(PROTECTED)))]
+                delay_ns = max(victim.cycle_time_ns, PERIOD_NS) * 5 // 4
+                wire.spoil(victim.can_id, FrameFault.DELAY, delay_ns, 1)
             if enabled and rng.random() < 0.1:
                 for after, words in (*RECOVERY_STEPS, (70, {"enable": 1})):
                     supervisor.plan(period + after, **words)
@@ -140,10 +173,11 @@ def attacked_run(tmp_path: Path, seed: int, count: int, enabled: bool):
 
 def check(recording, log: np.ndarray) -> dict[str, int]:
     """Judge a run; return how many periods the controller moved and was in its safe state."""
-    own = log[(log[:, 1] & 0xFFFF_FFFF == CONTRACT.drive_command.can_id) & (log[:, 3] == 2)]
-    commands = [CONTRACT.drive_command.unpack(int(data) & (1 << 64) - 1) for data in own[:, 2]]
+    commands = sent_by(CONTROLLER, CONTRACT.drive_command, log)
     assert {command.controlword for command in commands} <= CONTROLWORDS
     assert max(abs(command.target_velocity) for command in commands) <= HIGHEST_COUNT
+    reports = sent_by(PLANT, CONTRACT.drive_status, log)
+    assert max(abs(report.actual_velocity) for report in reports) <= HIGHEST_COUNT
 
     controller = recording.controller
     timer_ns = controller["time_ns"] + PHASE_NS
@@ -161,6 +195,13 @@ def check(recording, log: np.ndarray) -> dict[str, int]:
     for rows, periods in needed:
         unjustified = moving[moving - newest_before(moving, rows) > periods * PERIOD_NS]
         assert not unjustified.size, unjustified[:5]
+    speed_rad_s = np.abs(recording.plant["motor_speed_rad_s"])
+    assert speed_rad_s.max() <= HIGHEST_RAD_S * (1 + 1e-9)
+    turning = (recording.plant["time_ns"][speed_rad_s > STANDSTILL_RAD_S]).astype(np.int64)
+    ordered = intact(recording.traffic, CONTRACT.drive_command)
+    enabling = ordered[ordered[:, 3] >> np.uint64(16) & np.uint64(0x8F) == 0x0F]
+    unordered = turning[turning - newest_before(turning, enabling) > COASTING_PERIODS * PERIOD_NS]
+    assert not unordered.size, unordered[:5]
     assert np.isfinite(recording.plant["position_m"]).all()
     assert -1e-3 < recording.plant["position_m"].min() <= recording.plant["position_m"].max() < 0.401
     return {"moving": len(moving), "safe": int((controller["state"] == State.SAFE).sum())}
