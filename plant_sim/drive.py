@@ -165,7 +165,6 @@ def drive_step(drive, controlword, target, arrived):  # type: ignore[no-untyped-
     elif drive[STATE] == _ENABLED:
         drive[MISSED] += 1
         if drive[MISSED] >= MISSED_COMMANDS_LIMIT:
-            drive[MISSED] = 0
             drive[STATE] = _REACTING  # 13
     if _NEXT_AFTER_RAMP[drive[STATE]] >= 0:
         remaining = max(abs(drive[SPEED_COUNTS]) - drive[RAMP_COUNTS], 0)

@@ -1,9 +1,9 @@
 """Mutation testing of the modules in assurance.toml: `make mutation`.
 
 Every mutant runs interpreted (NUMBA_DISABLE_JIT=1) in a forked process against the tests that reach it, until
-one fails. A change within a function replaces that function's code in a process in which all tests are already
+one fails. A change within a function replaces that function's code in a process in which all tests are
 collected; a change of what runs at import (tables, layouts) imports everything anew. Fails if the score is
-below the limit, if a survivor is not argued in survivors.toml, or if an entry there does not survive.
+below the limit, if a survivor is not argued in survivors.toml, or if one that is argued does not survive.
 
 Why own code: mutmut and cosmic-ray change files on disk, or wrap each function in a trampoline that numba
 cannot compile and an int32 array's view cannot pass; both leave module-level tables alone or pay an import
@@ -27,11 +27,7 @@ from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
-ENVIRONMENT = {"NUMBA_DISABLE_JIT": "1", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1"}
-if __name__ == "__main__" and any(os.environ.get(name) != value for name, value in ENVIRONMENT.items()):
-    os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | ENVIRONMENT)
-
-# the third-party packages are imported once, before any fork; our own not before they are mutated
+# third-party packages are imported once, before any fork; our own not before they are mutated
 import can  # noqa: F401
 import cantools  # noqa: F401
 import hypothesis
@@ -43,8 +39,16 @@ from _pytest.runner import runtestprotocol
 from hypothesis import Phase
 from mutators import Mutant, mutants
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
+ENVIRONMENT = {"NUMBA_DISABLE_JIT": "1", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1"}
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 SURVIVORS = HERE / "survivors.toml"
@@ -57,22 +61,41 @@ KILLED, SURVIVED = 1, 0
 Key = tuple[str, str, str, str]
 
 
-def read_settings() -> tuple[list[str], list[str]]:
-    """Return targets and tests of assurance.toml, relative to the repository."""
-    settings = tomllib.loads((HERE / "assurance.toml").read_text())
-    targets = [
-        str(file.relative_to(ROOT))
-        for pattern in settings["targets"]
-        for file in sorted(ROOT.glob(pattern))
-        if file.stat().st_size
-    ]
-    return targets, settings["tests"]
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Modules, and the tests that have to notice what changes in them; relative to the repository."""
+
+    targets: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+def read_groups() -> list[Group]:
+    """Return what assurance.toml says."""
+    groups = []
+    for group in tomllib.loads((HERE / "assurance.toml").read_text())["group"]:
+        files = [file for pattern in group["targets"] for file in sorted(ROOT.glob(pattern))]
+        targets = tuple(str(file.relative_to(ROOT)) for file in files if file.stat().st_size)
+        groups.append(Group(targets, tuple(group["tests"])))
+    return groups
 
 
 def read_survivors() -> dict[Key, str]:
     """Return the reason of each argued survivor by its key."""
-    entries = tomllib.loads(SURVIVORS.read_text()).get("survivor", [])
-    return {(e["file"], e["scope"], e["line"], e["change"]): e["reason"] for e in entries}
+    return {
+        (argument["file"], *mutant): argument["reason"]
+        for argument in tomllib.loads(SURVIVORS.read_text()).get("argument", [])
+        for mutant in argument["mutants"]
+    }
+
+
+def to_argue(survivors: Sequence[Mutant]) -> str:
+    """Return entries for survivors.toml whose reason is still to be given."""
+    text = ""
+    for file in dict.fromkeys(mutant.file for mutant in survivors):
+        keys = [mutant.key[1:] for mutant in survivors if mutant.file == file]
+        lines = "".join(f"    {json.dumps(key)},\n" for key in keys)
+        text += f'[[argument]]\nfile = "{file}"\nreason = ""\nmutants = [\n{lines}]\n\n'
+    return text
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +197,9 @@ def _run_tests(tests: Sequence[Reached], items: dict[str, Any]) -> int:
     for test, next_test in zip(tests, [*tests[1:], None], strict=True):
         _limit_cpu(1.0 + 10.0 * test.cpu_s)
         next_item = items[next_test.node_id] if next_test else None
-        if any(report.failed for report in runtestprotocol(items[test.node_id], log=False, nextitem=next_item)):
+        if any(
+            report.failed for report in runtestprotocol(items[test.node_id], log=False, nextitem=next_item)
+        ):
             return KILLED
     return SURVIVED
 
@@ -199,7 +224,7 @@ class ChangedModule(importlib.machinery.SourceFileLoader):
         return self._code
 
 
-def run_at_import(tests: list[str], reached: list[Reached]) -> Callable[[Mutant], int]:
+def run_at_import(tests: Sequence[str], reached: list[Reached]) -> Callable[[Mutant], int]:
     """Return what runs a mutant of code that runs at import: it imports everything anew, file by file."""
     of_file = {name: [test for test in reached if test.node_id.startswith(name)] for name in tests}
 
@@ -248,7 +273,7 @@ def _silently(work: Callable[[], int]) -> None:
 
 
 def run_within(
-    todo: Sequence[Mutant], tests: list[str], jobs: int, told: Callable[[int, int], None]
+    todo: Sequence[Mutant], tests: Sequence[str], jobs: int, told: Callable[[int, int], None]
 ) -> list[Reached]:
     """Run the mutants of functions; return what the tests reach."""
     reader, writer = os.pipe()
@@ -271,18 +296,19 @@ def run_within(
     return [Reached(node_id, frozenset(map(tuple, functions)), cpu_s) for node_id, functions, cpu_s in last]
 
 
-def survivors_of(chosen: Sequence[Mutant], tests: list[str], jobs: int, progress: Progress) -> list[Mutant]:
+def survivors_of(
+    chosen: Sequence[Mutant], tests: Sequence[str], jobs: int, progress: Progress, task: TaskID
+) -> list[Mutant]:
     """Run the mutants; return those that no test noticed."""
     within = [mutant for mutant in chosen if mutant.scope]
     at_import = [mutant for mutant in chosen if not mutant.scope]
     survivors: list[Mutant] = []
-    task = progress.add_task("mutants", total=len(chosen))
 
     def tell(todo: list[Mutant]) -> Callable[[int, int], None]:
         def told(index: int, outcome: int) -> None:
             if outcome == SURVIVED:
                 survivors.append(todo[index])
-                progress.print(f"survives: {todo[index].where}: {todo[index].change}", soft_wrap=True)
+                progress.console.print(f"survives: {todo[index].where}: {todo[index].change}", markup=False)
             progress.advance(task)
 
         return told
@@ -296,7 +322,10 @@ def table(chosen: Sequence[Mutant], survivors: Sequence[Mutant]) -> str:
     """Return the score of each file as a Markdown table."""
     total, alive = (Counter(mutant.file for mutant in some) for some in (chosen, survivors))
     rows = ["| file | mutants | killed | score |", "|---|---:|---:|---:|"]
-    for name, count, left in [*((f, total[f], alive[f]) for f in total), ("all", len(chosen), len(survivors))]:
+    for name, count, left in [
+        *((f, total[f], alive[f]) for f in total),
+        ("all", len(chosen), len(survivors)),
+    ]:
         rows.append(f"| {name} | {count} | {count - left} | {score_percent(count, left):.1f} % |")
     return "\n".join(rows) + "\n"
 
@@ -332,23 +361,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="mutants at a time")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
     options = parser.parse_args(arguments)
+    if any(os.environ.get(name) != value for name, value in ENVIRONMENT.items()):
+        os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | ENVIRONMENT)
     os.chdir(ROOT)
-    targets, tests = read_settings()
-    chosen = [
-        mutant
-        for target in targets
-        if options.only in target
-        for mutant in mutants(target, (ROOT / target).read_text())
-    ]
+    todo = {
+        group: [
+            mutant
+            for target in group.targets
+            if options.only in target
+            for mutant in mutants(target, (ROOT / target).read_text())
+        ]
+        for group in read_groups()
+    }
+    chosen = [mutant for group in todo.values() for mutant in group]
     if not chosen:
-        parser.error(f"no target's path contains {options.only!r}; the targets: {', '.join(targets)}")
+        known = ", ".join(target for group in todo for target in group.targets)
+        parser.error(f"no target's path contains {options.only!r}; the targets: {known}")
     begin = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        survivors = survivors_of(chosen, tests, options.jobs, progress)
+        task = progress.add_task("mutants", total=len(chosen))
+        survivors = [
+            survivor
+            for group, mutants_of in todo.items()
+            if mutants_of
+            for survivor in survivors_of(mutants_of, group.tests, options.jobs, progress, task)
+        ]
     print(table(chosen, survivors))
     print(f"{time.monotonic() - begin:.0f} s, {options.jobs} at a time")
-    wrong = list(complaints(chosen, survivors, read_survivors()))
+    argued = read_survivors()
+    wrong = list(complaints(chosen, survivors, argued))
+    print(to_argue([mutant for mutant in survivors if mutant.key not in argued]))
     if not options.only:
         wrong += page_complaints(table(chosen, survivors), options.write)
     for complaint in wrong:

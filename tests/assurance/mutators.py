@@ -175,6 +175,8 @@ def _replacements(node: ast.AST, scope: str) -> Iterator[ast.AST]:
         case ast.Constant(value=int() | float() as value):
             yield ast.Constant(value + 1)
             yield ast.Constant(value - 1)
+        case ast.Call(func=ast.Name(id="min" | "max")):
+            pass
         case ast.Call(func=function, args=arguments, keywords=keywords):
             for place in range(len(arguments) - 1):
                 if not any(isinstance(a, ast.Starred) for a in arguments[place : place + 2]):

@@ -123,10 +123,51 @@ def test_what_the_sender_protects_the_receiver_accepts(data):
             [INITIAL, WRONGSEQUENCE, WRONGSEQUENCE, SYNC, OK],
             id="a second jump starts the synchronisation anew",
         ),
+        pytest.param([1, 1, 1, 1, 2], [INITIAL, *[REPEATED] * 3, OK], id="repetitions up to the limit"),
+        pytest.param(
+            [1, *[NOTHING] * 3, 2, *[NOTHING] * 3, 3],
+            [INITIAL, *[NONEWDATA] * 3, OK, *[NONEWDATA] * 3, OK],
+            id="valid data end a silence",
+        ),
+        pytest.param(
+            [1, 2, *[NOTHING] * 4, 3, 4, 5],
+            [INITIAL, OK, *[NONEWDATA] * 4, SYNC, SYNC, OK],
+            id="silence beyond the limit after valid data",
+        ),
+        pytest.param(
+            [1, *[NOTHING] * 4, 12, 13, 14],
+            [INITIAL, *[NONEWDATA] * 4, WRONGSEQUENCE, SYNC, OK],
+            id="a jump ends a silence",
+        ),
+        pytest.param(
+            [1, 12, *[NOTHING] * 3, 13, 14],
+            [INITIAL, WRONGSEQUENCE, *[NONEWDATA] * 3, SYNC, OK],
+            id="silence up to the limit after a jump",
+        ),
+        pytest.param(
+            [1, 12, *[NOTHING] * 4, 13, 14, 15],
+            [INITIAL, WRONGSEQUENCE, *[NONEWDATA] * 4, SYNC, SYNC, OK],
+            id="silence beyond the limit after a jump",
+        ),
     ],
 )
 def test_receiver_status(events, expected):
     assert statuses(events) == expected
+
+
+@pytest.mark.parametrize(("event", "status"), [(NOTHING, NONEWDATA), (1, REPEATED)])
+def test_the_count_of_bad_checks_stops_at_15(event, status):
+    """With a limit of 15 no silence and no repetition is ever too long."""
+    events, expected = [1, *[event] * 20, 2], [INITIAL, *[status] * 20, OK]
+    assert statuses(events, max_no_new_or_repeated_data=15) == expected
+    expected[-1] = SYNC
+    assert statuses(events, max_no_new_or_repeated_data=14) == expected
+
+
+def test_all_bytes_are_data_ids():
+    data_ids = [0, 255, *range(14)]
+    protector, checker = Protector(data_ids, DLC), Checker(data_ids, DLC)
+    assert [checker.check(protector.protect(0)) for _ in range(20)] == [INITIAL] + 19 * [OK]
 
 
 def test_without_synchronisation_a_wrong_sequence_does_not_move_the_expected_counter():

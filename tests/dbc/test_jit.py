@@ -1,5 +1,6 @@
 """The compiled-code cache must never run machine code of a source that has changed."""
 
+import os
 import subprocess
 import sys
 
@@ -21,6 +22,28 @@ def step(x):
 """
 
 REPORT = "import outer; print(outer.twice(0), sum(outer.twice.stats.cache_hits.values()))"
+
+
+INTERPRETED = """
+import numpy as np
+from dbc.jit import entry_point, njit
+
+@njit("uint64(int32[::1], uint64)")
+def add(words, data):
+    words[0] += 1
+    return data + np.uint64(words[0])
+
+words = np.array([41], np.int32)
+total = entry_point(add)(words, np.uint64(2**63))
+print(type(total) is int, total == 2**63 + 42, words[0], hasattr(add, "overloads"))
+"""
+
+
+def test_without_jit_the_same_function_runs_interpreted_on_plain_integers():
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-c", INTERPRETED]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["True", "True", "42", "False"]
 
 
 def run(directory):

@@ -521,8 +521,29 @@ def entry(seed, law):
     return case, io
 
 
+RESETS = {
+    "td": (td.td_reset, {"V1": "x", "V2": 0, "V3": 0}),
+    "eso": (eso.eso_reset, {"Z1": "x", "Z2": 0, "Z3": 0, "Z4": 0}),
+    "adrc": (adrc.adrc_reset, {"V1": "x", "V2": 0, "V3": 0, "Z1": "x", "Z2": 0, "Z3": 0, "Z4": 0}),
+    "front_end": (front_end.front_end_reset, {"V1": "x", "V2": 0, "V3": 0, "V2_SMOOTH": 0}),
+    "limiter": (limiter.limiter_reset, {"LIMITER_INPUT": "x", "LIMITER_POSITION": "x", "LIMITER_RATE": 0}),
+    "pi": (pi.pi_reset, {"INTEGRAL": 0}),
+    "scheduled": (scheduled.scheduled_reset, {"MOTOR": 0, "DISTURBANCE": 0}),
+    "command_filter": (command_filter.command_filter_reset, {"COMMAND": 0}),
+}
+
+
+@pytest.mark.parametrize("part", RESETS)
+def test_each_part_starts_at_rest_and_leaves_the_others_alone(part):
+    reset, states = RESETS[part]
+    case = Case(0)
+    reset(case.state, case.position) if "x" in states.values() else reset(case.state)
+    case.assert_became(**{name: case.position if to == "x" else to for name, to in states.items()})
+
+
 def test_reset_starts_all_laws_at_rest_at_the_position():
     case, io = entry(0, 4)
+    case.state[k.ST_SATURATIONS] = 7
     control.control_reset(case.words, case.state, io)
     x = units.metres_from_position(100_000)
     expected = dict.fromkeys(ALL_STATES, 0) | dict.fromkeys(POSITIONS, x) | {"LAW": 4}
@@ -541,6 +562,29 @@ LAW_STEPS = {
     0: lambda c, s, r, x: 0,
     6: lambda c, s, r, x: 0,
 }
+
+
+@pytest.mark.parametrize("law", LAW_STEPS)
+def test_each_law_has_its_number(law):
+    case, parts = Case(2), Case(2)
+    case.state[k.ST_LAW] = parts.state[k.ST_LAW] = law
+    wanted = LAW_STEPS[law](parts.words, parts.state, parts.setpoint, parts.position)
+    assert control.law_step(case.words, case.state, case.setpoint, case.position) == wanted
+    assert case.state == parts.state
+
+
+@pytest.mark.parametrize(("z1", "flags"), [(0, 0), (HIGH, 4)])
+def test_a_state_that_saturates_is_flagged_in_its_tick(z1, flags):
+    case = Case(0)
+    for index in GAINS:
+        case.words[index] = 0
+    case.state = [0] * k.ST_SIZE
+    case.state[k.ST_LAW], case.state[k.ST_SATURATIONS] = k.LAW_ADRC, 3
+    case.state[k.ST_Z1] = case.state[k.ST_Z2] = z1
+    io = [0] * k.IO_SIZE
+    io[k.IO_LAW] = k.LAW_ADRC
+    control.control_step(case.words, case.state, io)
+    assert io == [k.LAW_ADRC, 0, 0, 0, flags, 3 + flags // 4]
 
 
 @pytest.mark.parametrize("law", LAW_STEPS)

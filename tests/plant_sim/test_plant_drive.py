@@ -176,6 +176,18 @@ def test_quick_stop_takes_79_ms_from_full_speed_then_disables(target):
     assert drive.state == DISABLED
 
 
+@pytest.mark.parametrize(("deceleration_rad_s2", "periods"), [(1.0, 6), (27.0, 6), (53.0, 3), (53.0e3, 1)])
+def test_a_stop_loses_whole_counts_each_period_and_at_least_one(deceleration_rad_s2, periods):
+    drive = Drive(deceleration_rad_s2=deceleration_rad_s2)
+    for command in [(SHUTDOWN, 0), (SWITCH_ON, 0), (ENABLE, 0), (ENABLE, 6)]:
+        drive.step(command)
+    steps = 0
+    while drive.state != DISABLED:
+        drive.step((QUICK_STOP, 6))
+        steps += 1
+    assert steps == periods
+
+
 def test_two_missed_commands_hold_the_last_target():
     drive = drive_in(ENABLED)
     assert [drive.step(None) for _ in range(2)] == pytest.approx([100.0 * math.pi] * 2)
