@@ -23,7 +23,6 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
@@ -36,6 +35,7 @@ import numpy as np  # noqa: F401
 import pytest
 import scipy.optimize  # noqa: F401
 from _pytest.runner import runtestprotocol
+from groups import ENVIRONMENT, HERE, ROOT, read_groups
 from hypothesis import Phase
 from mutators import Mutant, mutants
 from rich.console import Console
@@ -48,9 +48,6 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-ENVIRONMENT = {"NUMBA_DISABLE_JIT": "1", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1"}
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
 SURVIVORS = HERE / "survivors.toml"
 PAGE = ROOT / "docs" / "testing.md"
 BEGIN, END = "<!-- mutation: begin -->\n", "<!-- mutation: end -->\n"
@@ -59,24 +56,6 @@ PYTEST_OPTIONS = ("-q", "-x", "--tb=native", "-p", "no:hil", "-p", "no:cacheprov
 KILLED, SURVIVED = 1, 0
 
 Key = tuple[str, str, str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Modules, and the tests that have to notice what changes in them; relative to the repository."""
-
-    targets: tuple[str, ...]
-    tests: tuple[str, ...]
-
-
-def read_groups() -> list[Group]:
-    """Return what assurance.toml says."""
-    groups = []
-    for group in tomllib.loads((HERE / "assurance.toml").read_text())["group"]:
-        files = [file for pattern in group["targets"] for file in sorted(ROOT.glob(pattern))]
-        targets = tuple(str(file.relative_to(ROOT)) for file in files if file.stat().st_size)
-        groups.append(Group(targets, tuple(group["tests"])))
-    return groups
 
 
 def read_survivors() -> dict[Key, str]:
