@@ -35,7 +35,7 @@ import numpy as np  # noqa: F401
 import pytest
 import scipy.optimize  # noqa: F401
 from _pytest.runner import runtestprotocol
-from groups import ENVIRONMENT, HERE, ROOT, read_groups
+from groups import ENVIRONMENT, HERE, ROOT, Group, read_groups
 from hypothesis import Phase
 from mutators import Mutant, mutants
 from rich.console import Console
@@ -52,7 +52,7 @@ SURVIVORS = HERE / "survivors.toml"
 PAGE = ROOT / "docs" / "testing.md"
 BEGIN, END = "<!-- mutation: begin -->\n", "<!-- mutation: end -->\n"
 SCORE_LIMIT_PERCENT = 95.0
-PYTEST_OPTIONS = ("-q", "-x", "--tb=native", "-p", "no:hil", "-p", "no:cacheprovider", "-W", "ignore")
+FIRST_FAILURE = ("-x", "--tb=native")
 KILLED, SURVIVED = 1, 0
 
 Key = tuple[str, str, str, str]
@@ -203,9 +203,9 @@ class ChangedModule(importlib.machinery.SourceFileLoader):
         return self._code
 
 
-def run_at_import(tests: Sequence[str], reached: list[Reached]) -> Callable[[Mutant], int]:
+def run_at_import(group: Group, reached: list[Reached]) -> Callable[[Mutant], int]:
     """Return what runs a mutant of code that runs at import: it imports everything anew, file by file."""
-    of_file = {name: [test for test in reached if test.node_id.startswith(name)] for name in tests}
+    of_file = {name: [test for test in reached if test.node_id.startswith(name)] for name in group.tests}
 
     def run(mutant: Mutant) -> int:
         directory = os.path.dirname(mutant.file)
@@ -216,9 +216,9 @@ def run_at_import(tests: Sequence[str], reached: list[Reached]) -> Callable[[Mut
             return mutant.file not in files, not near, sum(test.cpu_s for test in of_file[name])
 
         sys.meta_path.insert(0, ChangedModule(mutant.file, mutant.compile(str(ROOT / mutant.file))))  # type: ignore[arg-type]
-        for name in sorted(tests, key=rank):
+        for name in sorted(group.tests, key=rank):
             _limit_cpu(5.0 + 5.0 * sum(test.cpu_s for test in of_file[name]))
-            if pytest.main([*PYTEST_OPTIONS, name], plugins=[Deterministic()]) != 0:
+            if pytest.main([*FIRST_FAILURE, *group.options, name], plugins=[Deterministic()]) != 0:
                 return KILLED
         return SURVIVED
 
@@ -252,7 +252,7 @@ def _silently(work: Callable[[], int]) -> None:
 
 
 def run_within(
-    todo: Sequence[Mutant], tests: Sequence[str], jobs: int, told: Callable[[int, int], None]
+    todo: Sequence[Mutant], group: Group, jobs: int, told: Callable[[int, int], None]
 ) -> list[Reached]:
     """Run the mutants of functions; return what the tests reach."""
     reader, writer = os.pipe()
@@ -261,7 +261,7 @@ def run_within(
         os.close(reader)
         with os.fdopen(writer, "w", buffering=1) as pipe:
             server = Server(todo, jobs, lambda *outcome: print(json.dumps(outcome), file=pipe))
-            code = int(pytest.main([*PYTEST_OPTIONS, *tests], plugins=[server]))
+            code = int(pytest.main([*FIRST_FAILURE, *group.options, *group.tests], plugins=[server]))
             print(json.dumps([[t.node_id, sorted(t.functions), t.cpu_s] for t in server.reached]), file=pipe)
         os._exit(code)
     os.close(writer)
@@ -276,7 +276,7 @@ def run_within(
 
 
 def survivors_of(
-    chosen: Sequence[Mutant], tests: Sequence[str], jobs: int, progress: Progress, task: TaskID
+    chosen: Sequence[Mutant], group: Group, jobs: int, progress: Progress, task: TaskID
 ) -> list[Mutant]:
     """Run the mutants; return those that no test noticed."""
     within = [mutant for mutant in chosen if mutant.scope]
@@ -292,8 +292,8 @@ def survivors_of(
 
         return told
 
-    reached = run_within(within, tests, jobs, tell(within))
-    for_each(at_import, run_at_import(tests, reached), jobs, tell(at_import))
+    reached = run_within(within, group, jobs, tell(within))
+    for_each(at_import, run_at_import(group, reached), jobs, tell(at_import))
     return sorted(survivors, key=lambda mutant: (mutant.file, mutant.line_number))
 
 
@@ -364,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             survivor
             for group, mutants_of in todo.items()
             if mutants_of
-            for survivor in survivors_of(mutants_of, group.tests, options.jobs, progress, task)
+            for survivor in survivors_of(mutants_of, group, options.jobs, progress, task)
         ]
     print(table(chosen, survivors))
     print(f"{time.monotonic() - begin:.0f} s, {options.jobs} at a time")
