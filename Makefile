@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run reproduce test test-long test-vcan check bench figures c clean
+.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c clean
 
 run: $(READY)  ## the main job: the 10 s sine under the robust ADRC, three processes in lock-step
 	$(BIN)/hil run sine
@@ -15,6 +15,12 @@ test: $(READY)  ## all tests that need nothing but this machine
 
 test-long: $(READY)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m long
+
+coverage: $(READY)  ## every line and branch of kernel, E2E and state machines is tested
+	$(BIN)/python tests/assurance/coverage_run.py
+
+mutation: $(READY)  ## small faults in the same modules are noticed; ARGS=--write puts the scores into docs/testing.md
+	$(BIN)/python tests/assurance/mutation.py $(ARGS)
 
 test-vcan: $(READY)  ## the loop on a real vcan0, in a User-Mode Linux guest
 	$(BIN)/python -m pytest tests/vcan -m boots_guest

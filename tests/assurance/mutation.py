@@ -315,28 +315,27 @@ def score_percent(count: int, left: int) -> float:
 
 
 def complaints(
-    chosen: Sequence[Mutant], survivors: Sequence[Mutant], argued: dict[Key, str]
+    chosen: Sequence[Mutant], survivors: Sequence[Mutant], argued: dict[Key, str], complete: bool
 ) -> Iterable[str]:
-    """What is wrong with the outcome, a line each."""
+    """What is wrong with the outcome, a line each; a run that is not `complete` has no score."""
     score = score_percent(len(chosen), len(survivors))
-    if score < SCORE_LIMIT_PERCENT:
+    if complete and score < SCORE_LIMIT_PERCENT:
         yield f"score {score:.1f} % is below {SCORE_LIMIT_PERCENT} %"
     alive = {mutant.key for mutant in survivors}
     for mutant in survivors:
-        if mutant.key not in argued:
+        if not argued.get(mutant.key, "").strip():
             yield f"survives without an argument: {mutant.where}: {mutant.change}"
-    files = {mutant.file for mutant in chosen}
-    for key, reason in argued.items():
-        if key[0] in files and key not in alive:
+    known = {mutant.key for mutant in chosen}
+    for key in argued:
+        if key not in alive and (complete or key in known):
             yield f"survivors.toml argues what does not survive: {key[0]} in {key[1] or 'module'}: {key[3]}"
-        if not reason.strip():
-            yield f"survivors.toml gives no reason: {key[0]}: {key[3]}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 if all is well, 1 if not."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--only", metavar="TEXT", default="", help="files whose path contains TEXT")
+    parser.add_argument("--line", metavar="TEXT", default="", help="source lines that contain TEXT")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="mutants at a time")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
     options = parser.parse_args(arguments)
@@ -349,13 +348,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for target in group.targets
             if options.only in target
             for mutant in mutants(target, (ROOT / target).read_text())
+            if options.line in mutant.line
         ]
         for group in read_groups()
     }
     chosen = [mutant for group in todo.values() for mutant in group]
     if not chosen:
         known = ", ".join(target for group in todo for target in group.targets)
-        parser.error(f"no target's path contains {options.only!r}; the targets: {known}")
+        parser.error(f"no such mutant; the targets: {known}")
     begin = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
@@ -369,9 +369,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(table(chosen, survivors))
     print(f"{time.monotonic() - begin:.0f} s, {options.jobs} at a time")
     argued = read_survivors()
-    wrong = list(complaints(chosen, survivors, argued))
+    complete = not options.only and not options.line
+    wrong = list(complaints(chosen, survivors, argued, complete))
     print(to_argue([mutant for mutant in survivors if mutant.key not in argued]))
-    if not options.only:
+    if complete:
         wrong += page_complaints(table(chosen, survivors), options.write)
     for complaint in wrong:
         print(complaint, file=sys.stderr)
@@ -385,7 +386,7 @@ def page_complaints(measured: str, write: bool) -> list[str]:
     if write:
         PAGE.write_text(before + BEGIN + measured + END + after)
     elif printed != measured:
-        return [f"the table in {PAGE.relative_to(ROOT)} is not the one measured: make mutation-table"]
+        return [f"the table in {PAGE.relative_to(ROOT)} is not the one measured: make mutation ARGS=--write"]
     return []
 
 

@@ -170,6 +170,12 @@ def test_isqrt_is_the_floor_of_the_root():
     roots = [*range(70), *(2**n for n in range(7, 32)), 46340, 46341, 3037000499]
     for value in {clip(root**2 + off, 0, 2**63 - 1) for root in roots for off in (-1, 0, 1)}:
         assert fixedpoint.isqrt(value) == math.isqrt(value), value
+    rng = np.random.default_rng(0)
+    for bits in range(1, 64):  # every size, and squares where the two halves of the root meet
+        for value in rng.integers(2 ** (bits - 1), 2**bits, 20, dtype=np.uint64).tolist():
+            square = math.isqrt(value) ** 2
+            for near in {value, square, square - 1 if square else 0}:
+                assert fixedpoint.isqrt(near) == math.isqrt(near), near
     assert fixedpoint.isqrt(2**63 - 1) == math.isqrt(2**63 - 1)
 
 
