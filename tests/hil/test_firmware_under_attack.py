@@ -3,6 +3,7 @@
 The oracle knows the bus and bitwise CRCs only: nothing of mailboxes, counters or the state machine.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -231,3 +232,44 @@ def test_a_million_hostile_frames(tmp_path, seed):
 def test_the_same_seed_is_the_same_attack(tmp_path):
     one, other = (attacked_run(tmp_path, 7, 500, enabled=True)[0].traffic for _ in range(2))
     assert np.array_equal(one, other)
+
+
+def doctored(recording, side: str, column: str, row: int, value: float):
+    columns = {name: values.copy() for name, values in getattr(recording, side).items()}
+    columns[column][row] = value
+    return replace(recording, **{side: columns})
+
+
+@pytest.mark.parametrize(
+    ("side", "column", "value"),
+    [
+        ("controller", "target_velocity_0p25rpm", 4),  # without an enable
+        ("controller", "target_velocity_0p25rpm", 12_001),
+        ("plant", "motor_speed_rad_s", 2.0),  # without a command that enables
+        ("plant", "position_m", 0.402),
+        ("plant", "position_m", np.nan),
+    ],
+)
+def test_the_oracle_sees_a_single_period_that_must_not_be(quiet_run, side, column, value):
+    recording, log = quiet_run
+    check(recording, log)
+    with pytest.raises(AssertionError):
+        check(doctored(recording, side, column, 200, value), log)
+
+
+@pytest.mark.parametrize(
+    ("message", "bits"), [("drive_command", 12_001 << 32), ("drive_command", 0x10 << 16)]
+)
+def test_the_oracle_sees_a_single_frame_that_must_not_be(quiet_run, bits):
+    recording, log = quiet_run
+    log = log.copy()
+    (first, *_) = np.flatnonzero(log[:, 1] & 0xFFFF_FFFF == getattr(CONTRACT, message).can_id)
+    log[first, 2] = bits
+    with pytest.raises(AssertionError):
+        check(recording, log)
+
+
+@pytest.fixture(scope="module")
+def quiet_run(tmp_path_factory):
+    """A short attack on a machine that nobody enables."""
+    return attacked_run(tmp_path_factory.mktemp("quiet"), 3, 200, enabled=False)
