@@ -74,10 +74,15 @@ def run_period(memory):  # type: ignore[no-untyped-def]
 
 
 @register_jitable
+def _unsigned(word):  # type: ignore[no-untyped-def]
+    return np.uint64(np.int64(word) & 0xFFFF_FFFF)
+
+
+@register_jitable
 def data_of(frames, frame):  # type: ignore[no-untyped-def]
     """Payload of the frame at an index, as uint64."""
-    high = np.uint64(np.uint32(frames[frame + at.FRAME_HIGH]))
-    return high << np.uint64(32) | np.uint64(np.uint32(frames[frame + at.FRAME_LOW]))
+    high = _unsigned(frames[frame + at.FRAME_HIGH])
+    return high << np.uint64(32) | _unsigned(frames[frame + at.FRAME_LOW])
 
 
 @register_jitable
@@ -112,7 +117,7 @@ def _period(memory, sends, row, now_ns):  # type: ignore[no-untyped-def]
     frames = memory[FRAMES_SENT]
     for number in range(count):
         frame = number * at.FRAME_SIZE
-        sends[number, 0] = np.uint32(frames[frame + at.FRAME_ID])
+        sends[number, 0] = _unsigned(frames[frame + at.FRAME_ID])
         sends[number, 1] = frames[frame + at.FRAME_LENGTH]
         sends[number, 2] = data_of(frames, frame)
     return count

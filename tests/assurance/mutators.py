@@ -33,6 +33,8 @@ OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
     ast.BitOr: ast.BitAnd,
     ast.BitXor: ast.BitAnd,
 }
+LONG_TABLE = 32
+"""Of more numbers in a row only the first and the last are changed: the rest would only raise the score."""
 NOT_RUN = {"annotation", "returns", "decorator_list"}
 """Fields of syntax nodes that do nothing when the code runs interpreted."""
 
@@ -128,10 +130,18 @@ def _nodes(parent: ast.AST, scope: str) -> Iterator[tuple[str, ast.AST, str, int
         inner = scope
         if named and (field == "body" or isinstance(parent, ast.ClassDef)):
             inner = _nested(parent, scope)
-        for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
+        for index, node in _shortened(value):
             if isinstance(node, ast.AST) and not _is_text(node):
                 yield _function(inner), parent, field, index, node
                 yield from _nodes(node, inner)
+
+
+def _shortened(value: Any) -> list[tuple[int | None, Any]]:
+    if not isinstance(value, list):
+        return [(None, value)]
+    nodes = list(enumerate(value))
+    is_long = len(nodes) > LONG_TABLE and all(isinstance(node, ast.Constant) for node in value)
+    return [nodes[0], nodes[-1]] if is_long else nodes  # type: ignore[return-value]
 
 
 def _nested(parent: Any, scope: str) -> str:

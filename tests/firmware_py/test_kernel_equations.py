@@ -11,6 +11,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from dbc import machine
 from dbc.contract import Contract
 from firmware_py.calibration import GAINS
 from firmware_py.kernel import (
@@ -22,7 +23,6 @@ from firmware_py.kernel import (
     fixedpoint,
     front_end,
     limiter,
-    machine,
     nfcl,
     pi,
     schedule,

@@ -257,13 +257,11 @@ def test_the_oracle_sees_a_single_period_that_must_not_be(quiet_run, side, colum
         check(doctored(recording, side, column, 200, value), log)
 
 
-@pytest.mark.parametrize(
-    ("message", "bits"), [("drive_command", 12_001 << 32), ("drive_command", 0x10 << 16)]
-)
+@pytest.mark.parametrize("bits", [12_001 << 32, 0x10 << 16])
 def test_the_oracle_sees_a_single_frame_that_must_not_be(quiet_run, bits):
     recording, log = quiet_run
     log = log.copy()
-    (first, *_) = np.flatnonzero(log[:, 1] & 0xFFFF_FFFF == getattr(CONTRACT, message).can_id)
+    (first, *_) = np.flatnonzero(log[:, 1] & 0xFFFF_FFFF == CONTRACT.drive_command.can_id)
     log[first, 2] = bits
     with pytest.raises(AssertionError):
         check(recording, log)
