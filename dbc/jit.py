@@ -14,6 +14,9 @@ from typing import Any
 import numba
 import numpy as np
 
+INTERPRETED = bool(getattr(numba.config, "DISABLE_JIT", False))
+"""Whether the environment says NUMBA_DISABLE_JIT=1."""
+
 
 def source_digest(*modules: str) -> str:
     """Return the SHA-256 of the sources of `modules` (a package counts with all its modules)."""
@@ -44,7 +47,7 @@ def njit(signature: str, *, depends: tuple[str, ...] = ()) -> Callable[[Callable
     """
 
     def compile_function(function: Callable[..., Any]) -> Any:
-        if numba.config.DISABLE_JIT:
+        if INTERPRETED:
             return _interpreted(function)
         dispatcher: Any = numba.njit(error_model="numpy")(function)
         dispatcher.enable_caching()
@@ -62,7 +65,7 @@ def entry_point(function: Any) -> Callable[..., Any]:
 
     It skips numba's choice among signatures, which costs as much again as the call; there is only one.
     """
-    if numba.config.DISABLE_JIT:
+    if INTERPRETED:
         interpreted: Callable[..., Any] = function
         return interpreted
     (compiled,) = function.overloads.values()
@@ -84,5 +87,5 @@ def _plain(argument: Any) -> Any:
     if isinstance(argument, np.integer):
         return int(argument)
     if isinstance(argument, np.ndarray) and argument.dtype == np.int32:
-        return memoryview(argument)
+        return argument.data
     return argument

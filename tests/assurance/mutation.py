@@ -152,6 +152,16 @@ class Server(Deterministic):
         return sorted(tests, key=lambda test: test.cpu_s)
 
 
+class CheapestFirst(Deterministic):
+    """A change is mostly noticed by the cheapest tests already."""
+
+    def __init__(self, cost_s: dict[str, float]) -> None:
+        self._cost_s = cost_s
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        items.sort(key=lambda item: self._cost_s.get(item.nodeid, 0.0))
+
+
 def _functions(files: dict[str, str]) -> dict[tuple[str, str], list[FunctionType]]:
     """All living functions of the targets, however they were loaded, by file and qualified name."""
     found: dict[tuple[str, str], list[FunctionType]] = {}
@@ -207,6 +217,8 @@ def run_at_import(group: Group, reached: list[Reached]) -> Callable[[Mutant], in
     """Return what runs a mutant of code that runs at import: it imports everything anew, file by file."""
     of_file = {name: [test for test in reached if test.node_id.startswith(name)] for name in group.tests}
 
+    cheapest_first = CheapestFirst({test.node_id: test.cpu_s for test in reached})
+
     def run(mutant: Mutant) -> int:
         directory = os.path.dirname(mutant.file)
 
@@ -218,7 +230,7 @@ def run_at_import(group: Group, reached: list[Reached]) -> Callable[[Mutant], in
         sys.meta_path.insert(0, ChangedModule(mutant.file, mutant.compile(str(ROOT / mutant.file))))  # type: ignore[arg-type]
         for name in sorted(group.tests, key=rank):
             _limit_cpu(5.0 + 5.0 * sum(test.cpu_s for test in of_file[name]))
-            if pytest.main([*FIRST_FAILURE, *group.options, name], plugins=[Deterministic()]) != 0:
+            if pytest.main([*FIRST_FAILURE, *group.options, name], plugins=[cheapest_first]) != 0:
                 return KILLED
         return SURVIVED
 

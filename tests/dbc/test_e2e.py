@@ -5,8 +5,9 @@ from cantools.autosar import compute_profile2_crc
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dbc import profile2
 from dbc.contract import Contract
-from dbc.e2e import ACCEPTED, Checker, Protector, Status, profile2_crc
+from dbc.e2e import ACCEPTED, Checker, Protector, Status, profile2_crc, receiver_configuration
 
 DATA_IDS = Contract.load().drive_command.data_ids
 DLC = 6
@@ -180,6 +181,48 @@ def test_longer_synchronisation_needs_more_valid_counters():
 
 def test_a_tolerant_receiver_accepts_larger_gaps():
     assert statuses([1, 6, 7], max_delta_counter_init=4) == [INITIAL, OKSOMELOST, OK]
+
+
+def test_the_sizes_are_those_of_the_arrays():
+    assert len(receiver_configuration(DATA_IDS, DLC)) == profile2.CONFIGURATION_SIZE
+    names = ("NOT_FIRST", "LAST_VALID_COUNTER", "MAX_DELTA_COUNTER", "SYNC_COUNTER")
+    names += ("NO_NEW_OR_REPEATED_DATA_COUNTER", "LOST_DATA", "STATE_SIZE")
+    assert [getattr(profile2, name) for name in names] == list(range(7))
+
+
+def in_words(payload):
+    """A payload as restricted Python takes it: two signed 32-bit words."""
+    return [(payload >> shift & 0xFFFF_FFFF ^ 1 << 31) - (1 << 31) for shift in (0, 32)]
+
+
+@given(
+    events=st.lists(st.integers(0, 15) | st.sampled_from([NOTHING, CORRUPT]), max_size=60),
+    limits=st.tuples(st.integers(0, 3), st.integers(0, 4), st.integers(0, 2)),
+)
+def test_state_and_configuration_may_lie_anywhere_among_other_words(events, limits):
+    names = ("max_delta_counter_init", "max_no_new_or_repeated_data", "sync_counter_init")
+    expected = statuses(events, **dict(zip(names, limits, strict=True)))
+    others = [99] * 32
+    state = [*others, *[0] * profile2.STATE_SIZE, *others]
+    configuration = [*others, *DATA_IDS, DLC, *limits, *others]
+    received = {NOTHING: 0, CORRUPT: frame(3) ^ 1 << 20}
+    payloads = [received[event] if event in received else frame(event) for event in events]
+    found = [
+        profile2.profile2_check(state, 32, configuration, 32, *in_words(payload), int(event is not NOTHING))
+        for event, payload in zip(events, payloads, strict=True)
+    ]
+    assert found == expected
+    assert state[:32] == state[-32:] == others
+    for counter in range(16):
+        low, high = in_words(frame(counter))
+        assert profile2.profile2_protect(configuration, 32, counter, low | 0xFFF, high) == low
+
+
+@pytest.mark.parametrize(
+    ("status", "accepted"), [(status, status in (OK, SYNC, OKSOMELOST)) for status in Status]
+)
+def test_what_is_accepted(status, accepted):
+    assert profile2.profile2_is_accepted(status) == accepted
 
 
 def test_lost_messages_are_counted():
