@@ -160,7 +160,8 @@ def test_gain_takes_mantissa_and_the_shift_behind_it():
 
 
 @pytest.mark.parametrize(
-    ("dividend", "divisor"), [(7, 2), (-7, 2), (6, 3), (-6, 3), (0, 5), (1, 2), (-1, 2), (7, -2), (-7, -2)]
+    ("dividend", "divisor"),
+    [(7, 2), (-7, 2), (6, 3), (-6, 3), (0, 5), (1, 2), (-1, 2), (7, -2), (-7, -2), (7, -1)],
 )
 def test_div_truncates(dividend, divisor):
     assert machine.div(dividend, divisor) == truncated(Fraction(dividend, divisor))
@@ -221,6 +222,24 @@ def test_factors_of_the_units_are_right_to_31_bits(convert, factor):
             assert abs(convert(signed) - clip(exact)) <= Fraction(1, 2) + abs(exact) * Fraction(1, 2**31)
 
 
+@pytest.mark.parametrize(
+    ("convert", "factor"),
+    [
+        (units.metres_from_setpoint, Fraction(2**31, 10**7)),
+        (units.metres_from_position, Fraction(2**31, 10**6)),
+        (units.speed_from_velocity, Fraction(math.pi / 120) * 2**20),
+    ],
+)
+def test_factors_are_the_nearest_there_are(convert, factor):
+    """At full scale, where the factor's rounding to 31 bits adds up to an LSB at most."""
+    largest = math.floor(HIGH / factor) - 1
+    bits = 31 - math.ceil(math.log2(factor))
+    rounding = abs(half_up(factor * 2**bits) / Fraction(2**bits) - factor)
+    for value in range(largest - 300, largest):
+        for signed in (value, -value):
+            assert abs(convert(signed) - signed * factor) <= Fraction(1, 2) + value * rounding
+
+
 # the paper's ADRC
 
 
@@ -239,6 +258,13 @@ def test_fhan_is_eq_19(r, d):
     for x1 in (0, 1, -1, 2, d - 1, d, d + 1, -d, -d - 1, 3 * d, 50 * d, 2**34, -(2**35), 2**36):
         for a0 in (0, 1, -1, d // 3, -d // 2, d, -2 * d, 2**33, -(2**34)):
             assert td.fhan(x1, a0, r, d) == fhan(x1, a0, r, d)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_beyond_a_metre_fhan_takes_the_error_for_one_metre(side):
+    d, r = 2**25, 27_487_790
+    a0 = -side * ((math.isqrt(d * (d + 8 * 2**34)) - d) // 2 + 1000)
+    assert td.fhan(side * 2**36, a0, r, d) == side * truncated(Fraction(r * 1000, d))
 
 
 @pytest.mark.parametrize("d", [0, -1])
@@ -495,7 +521,7 @@ def test_the_approach_stops_in_the_gap(brake):
 
 @pytest.mark.parametrize("motion", [0, 1, -1, 40, 99, 100, 101, -100, -101, 5000])
 @pytest.mark.parametrize("gap", [0, 1, -1, 10, 11, 300, -300, 10_000, -10_000])
-@pytest.mark.parametrize("rate", [0, 35, -60])
+@pytest.mark.parametrize("rate", [0, 35, -60, 95, -95])
 def test_limiter_step(motion, gap, rate):
     limit, slew, brake = 100, 12, 10
     case = Case(0)

@@ -196,6 +196,13 @@ def check(recording, log: np.ndarray) -> dict[str, int]:
     for rows, periods in needed:
         unjustified = moving[moving - newest_before(moving, rows) > periods * PERIOD_NS]
         assert not unjustified.size, unjustified[:5]
+    state = controller["state"]
+    starts = np.flatnonzero((state[1:] == State.RUN) & (state[:-1] != State.RUN)) + 1
+    unready = timer_ns[(state != State.RUN) & (state != State.STANDBY)]
+    withdrawn = command[command[:, 3] >> np.uint64(16) & np.uint64(1) == 0]
+    last_unready = np.append(0, unready)[np.searchsorted(unready, timer_ns[starts])]
+    unarmed = starts[newest_before(timer_ns[starts], withdrawn) < last_unready]
+    assert not unarmed.size, unarmed[:5]
     speed_rad_s = np.abs(recording.plant["motor_speed_rad_s"])
     assert speed_rad_s.max() <= HIGHEST_RAD_S * (1 + 1e-9)
     turning = (recording.plant["time_ns"][speed_rad_s > STANDSTILL_RAD_S]).astype(np.int64)
