@@ -28,7 +28,7 @@ from hil.bus.link import LinkError
 from hil.bus.opening import bus_settings
 from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import DEFAULT_DATA_BIT_RATE, Wire
-from hil.faults.catalogue import fault_of_text
+from hil.faults.catalogue import fault_of_text, rows
 from hil.faults.fault import FaultError
 from hil.measure import result_of, trace_of
 from hil.report import OutputDirectory
@@ -126,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="KIND,K=V,...",
-        help="what goes wrong; may be repeated",
+        help="what goes wrong (hil list --faults)",
     )
     modes = " ".join(RIGS)
     run.add_argument("--mode", choices=RIGS, default="lockstep", metavar="MODE", help=f"{modes} (the first)")
@@ -187,6 +187,7 @@ def _parser() -> argparse.ArgumentParser:
 
     listing = commands.add_parser("list", help="list the built-in scenarios and tunings")
     listing.set_defaults(command=_list)
+    listing.add_argument("--faults", action="store_true", help="list the kinds of faults instead")
     return parser
 
 
@@ -354,7 +355,10 @@ def _vcan_status(_: argparse.Namespace) -> int:
     return EXIT_OK if status.usable else EXIT_UNUSABLE
 
 
-def _list(_: argparse.Namespace) -> int:
+def _list(arguments: argparse.Namespace) -> int:
+    if arguments.faults:
+        Console().print(_fault_table())
+        return EXIT_OK
     table = Table(box=None)
     table.add_column("scenario")
     table.add_column("length / s", justify="right")
@@ -371,3 +375,13 @@ def _list(_: argparse.Namespace) -> int:
         tunings.add_row(f"{name}{default}", controller_of(tuning.law))
     Console().print(tunings)
     return EXIT_OK
+
+
+def _fault_table() -> Table:
+    table = Table(box=None)
+    for heading in ("fault", "in real time", "parameters, in brackets the default of each"):
+        table.add_column(heading)
+    for row in rows():
+        what = f"{row.summary}\n{'; '.join(row.parameters).replace('`', '')}"
+        table.add_row(row.kind, "yes" if row.real_time else "", what)
+    return table

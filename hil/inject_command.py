@@ -24,7 +24,7 @@ from hil.run.options import BenchError
 
 EPILOG = """On hilbus: a lock-step run with `--channel` takes every fault and notes the bus time in
 result.json; `hil bus` takes those of the wire and, like any other interface, those of sensor and machine.
-at_s counts from now. `hil faults --list` shows the kinds."""
+at_s counts from now. `hil list --faults` shows the kinds."""
 
 Action = Callable[[], None]
 

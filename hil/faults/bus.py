@@ -15,7 +15,7 @@ class FrameFaultBase(WireFault):
 
     fault: ClassVar[FrameFault]
 
-    message: str = choice(*messages(), called="a message on the bus")
+    message: str = choice(*messages(), called="any on the bus")
     count: int = number(1, 1_000_000, "frames", default=1)
 
     def begin(self, stage: Stage) -> None:

@@ -27,7 +27,7 @@ _FURTHEST = 1e12
 class MessageFault(WireFault):
     """One that changes the next frames of a message before they are handed over."""
 
-    message: str = choice(*messages(), called="a message on the bus")
+    message: str = choice(*messages(), called="any on the bus")
     count: int = number(1, 1_000_000, "frames", default=1)
 
     @abstractmethod
@@ -76,7 +76,7 @@ class Duplicate(MessageFault):
 class ProtectionFault(MessageFault):
     """One of counter or CRC."""
 
-    message: str = choice(*PROTECTED, called="a message with counter and CRC")
+    message: str = choice(*PROTECTED, called="any with counter and CRC")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbc.contract import Contract
+from hil import cli
 from hil.faults.catalogue import KINDS, fault_of, fault_of_table, fault_of_text, rows
 from hil.faults.fault import FaultError
 from hil.faults.names import PROTECTED, messages, signals
@@ -112,6 +113,15 @@ def test_the_guide_lists_every_kind_with_its_parameters():
     begin, end = "<!-- kinds: begin -->\n", "<!-- kinds: end -->"
     shown = guide[guide.index(begin) + len(begin) : guide.index(end)]
     assert shown == kinds_table(), f"write this table:\n{kinds_table()}"
+
+
+def test_the_command_line_lists_them(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert cli.main(["list", "--faults"]) == 0
+    said = capsys.readouterr().out
+    first_words = [line.split()[0] for line in said.splitlines()[1:] if not line.startswith("  ")]
+    assert first_words == list(KINDS)
+    assert "bias_m -1 to 1 m" in said
 
 
 def test_the_readme_counts_them():
