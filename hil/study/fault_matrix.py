@@ -3,7 +3,7 @@
 import math
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from importlib import resources
 from typing import Any
@@ -175,37 +175,62 @@ def load_matrix(text: str | None = None) -> tuple[Case, ...]:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise MatrixError(f"fault matrix: {error}") from error
-    unharmed_mm = content.get("error_mm", {})
-    return tuple(case for row in content.get("fault", []) for case in _cases(row, unharmed_mm))
+    rows, unharmed_mm = content.get("fault", []), content.get("error_mm", {})
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise MatrixError("fault matrix: faults are tables [[fault]]")
+    if not isinstance(unharmed_mm, dict) or not set(unharmed_mm) <= set(PHASES):
+        raise MatrixError(f"fault matrix: error_mm is a table with some of {', '.join(PHASES)}")
+    return tuple(case for row in rows for case in _cases(row, unharmed_mm))
 
 
 def _cases(row: Mapping[str, Any], unharmed_mm: Mapping[str, float]) -> list[Case]:
+    name = str(row.get("fault", ""))
     try:
-        name = str(row["fault"])
         fault = fault_of_text(name)
-    except (KeyError, FaultError) as error:
+    except FaultError as error:
         raise MatrixError(f"fault matrix: {error}") from error
+    if fault.at_s:
+        raise MatrixError(f"fault matrix: {name}: the phase says when, without at_s")
+    drawn = row.get("drawn", [])
+    if not isinstance(drawn, list) or not set(drawn) <= set(PHASES):
+        raise MatrixError(f"fault matrix: {name}: drawn must be a list of some of {', '.join(PHASES)}")
     common = {key: value for key, value in row.items() if key not in ("fault", "drawn", *PHASES)}
     cases = []
     for phase in PHASES:
-        table = common | row.get(phase, {})
+        own = row.get(phase, {})
+        if not isinstance(own, dict):
+            raise MatrixError(f"fault matrix: {name}: {phase} must be a table")
+        table = common | own
         if table.get("reaction") == Reaction.TOLERATED and phase in unharmed_mm:
             table = {"error_mm": unharmed_mm[phase]} | table
-        expected = _expectation(f"{name} in {phase}", table)
-        cases.append(Case(name, fault, phase, expected, is_drawn=phase in row.get("drawn", ())))
+        cases.append(Case(name, fault, phase, _expectation(f"{name} in {phase}", table), phase in drawn))
     return cases
 
 
-def _expectation(where: str, table: Mapping[str, Any]) -> Expectation:
-    allowed = [item.name for item in fields(Expectation)]
-    if unknown := sorted(set(table) - set(allowed)):
-        raise MatrixError(f"fault matrix: {where}: no key {unknown[0]!r}, only {', '.join(allowed)}")
-    try:
-        kinds = {"by": Detector(table.get("by", Detector.NOBODY)), "reaction": Reaction(table["reaction"])}
-        expected = Expectation(**{**table, **kinds, "signals": tuple(sorted(table.get("signals", ())))})
-    except (KeyError, TypeError, ValueError) as error:
-        raise MatrixError(f"fault matrix: {where}: {error}") from error
-    known = {signal_name(str(fault.name)) for fault in ControllerFault}
-    if not set(expected.signals) <= known:
-        raise MatrixError(f"fault matrix: {where}: signals must be some of {', '.join(sorted(known))}")
-    return expected
+def _expectation(where: str, table: dict[str, Any]) -> Expectation:
+    values = {"by": Detector.NOBODY, "signals": []} | table
+    known = sorted(signal_name(str(fault.name)) for fault in ControllerFault)
+    allowed = {
+        "by": (lambda value: value in list(Detector), f"one of {', '.join(Detector)}"),
+        "reaction": (lambda value: value in list(Reaction), f"one of {', '.join(Reaction)}"),
+        "signals": (
+            lambda value: isinstance(value, list) and all(one in known for one in value),
+            f"a list of some of {', '.join(known)}",
+        ),
+        "source": (lambda value: isinstance(value, str), "a text"),
+        "within_ms": (_is_magnitude, "a number from 0 on"),
+        "trip_ms": (_is_magnitude, "a number from 0 on"),
+        "error_mm": (_is_magnitude, "a number from 0 on"),
+    }
+    for key in ("reaction", "source", *table):
+        if key not in allowed:
+            raise MatrixError(f"fault matrix: {where}: no key {key!r}, only {', '.join(allowed)}")
+        is_allowed, words = allowed[key]
+        if not is_allowed(values.get(key)):
+            raise MatrixError(f"fault matrix: {where}: {key} is {values.get(key)!r}, must be {words}")
+    kinds = {"by": Detector(values["by"]), "reaction": Reaction(values["reaction"])}
+    return Expectation(**values | kinds | {"signals": tuple(sorted(values["signals"]))})
+
+
+def _is_magnitude(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < math.inf
