@@ -26,8 +26,8 @@ from hil.bus.wire_time import INTERMISSION_BITS, traffic_bits
 from hil.bus_log import RESOLUTION_NS
 from hil.run.options import BenchError
 
-WAITING_FRAMES = 16
-"""How many frames of a message may be under way before the oldest counts as not recorded."""
+WAITING_FRAMES = 1000
+"""How many frames of a message may be under way, as on a bus that somebody else blocks."""
 
 OPEN_NS = 10 * PERIOD_NS
 """Frames handed over less than this before the log's end may have come after it."""
@@ -348,8 +348,8 @@ def _compared(message: MessageCodec[..., Any], heard: np.ndarray, computed: np.n
 def _partners(recorded: list[list[int]], computed: list[list[int]]) -> Iterator[int]:
     """Yield the index of the computed frame of each recorded one, -1 if there is none.
 
-    Of those that had been handed over by its end and have no partner yet, it is the oldest with the same
-    bits, since frames may be held up or lost; if none has them, it is the newest.
+    Of those that had been handed over by its end and have no partner yet, it is the newest with the same
+    bits, since frames may be held up or lost; if none has them, it is the newest of all.
     """
     waiting: deque[int] = deque(maxlen=WAITING_FRAMES)
     handed_over = 0
@@ -357,7 +357,7 @@ def _partners(recorded: list[list[int]], computed: list[list[int]]) -> Iterator[
         while handed_over < len(computed) and computed[handed_over][0] < end_ns:
             waiting.append(handed_over)
             handed_over += 1
-        partner = next((row for row in waiting if computed[row][2:] == content), None)
+        partner = next((row for row in reversed(waiting) if computed[row][2:] == content), None)
         if partner is None:
             partner = waiting[-1] if waiting else -1
         if partner >= 0:

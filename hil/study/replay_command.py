@@ -157,12 +157,12 @@ def _print(result: dict[str, Any]) -> None:
 
 
 def _beside(recorded: dict[str, Any] | None, computed: dict[str, Any] | None) -> Table:
-    """Return what differs in two frames of a message; None stands for one that is not there."""
+    """Return what differs in two frames of a message; of one alone, its data."""
     table = Table(box=None, padding=(0, 2))
     for heading in ("", "recorded", "computed"):
         table.add_column(heading, no_wrap=True)
     rows = [_cells(frame) for frame in (recorded, computed)]
-    for name in rows[0] | rows[1]:
+    for name in rows[0] | rows[1] if recorded and computed else ("data",):
         ours, theirs = (cells.get(name, "-") for cells in rows)
         if ours != theirs:
             table.add_row(name, ours, theirs)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbc.contract import Contract
-from dbc.frame import ERR_FLAG
+from dbc.frame import ERR_FLAG, Frame
 from dbc.node import PERIOD_NS
 from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.node import PHASE_NS
@@ -135,6 +135,7 @@ def faulty(message: str, fault: FrameFault, argument: int, count: int) -> Callab
         pytest.param(faulty("DriveStatus", FrameFault.REPEAT, 0, 3), id="repeated"),
         pytest.param(faulty("PositionFeedback", FrameFault.DESTROY, 40, 3), id="destroyed and sent again"),
         pytest.param(lambda wire: wire.disturb(1e-3, 50_000_000, seed=1), id="bit errors"),
+        pytest.param(lambda wire: wire.babble(Frame(0, 8, 0), 0, 60_000_000), id="held up for 60 ms"),
     ],
 )
 def test_a_run_with_faults_is_computed_again(tmp_path, spoil, suffix):
