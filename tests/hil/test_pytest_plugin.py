@@ -1,10 +1,8 @@
 """The bench in pytest, as its users run it: sessions of pytest in processes of their own."""
 
 import json
-import os
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 import xml.etree.ElementTree as ET
@@ -13,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from bench_runs import SAFETY_NET_S
+from bench_runs import forked
 
 from hil.bench import Bench
 from hil.run.inprocess import InprocessRig
@@ -138,15 +136,15 @@ class Session:
 
 def run_pytest(folder: Path, *arguments: str, cwd: Path | None = None) -> Session:
     with TemporaryDirectory() as sockets:  # a short path: a socket's has at most 107 characters
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--color=no", *arguments],
-            cwd=cwd or folder,
-            capture_output=True,
-            text=True,
-            timeout=10 * SAFETY_NET_S,
-            env=os.environ | {"XDG_RUNTIME_DIR": sockets, "PYTEST_ADDOPTS": "", "COLUMNS": "240"},
+        done = forked(
+            pytest.main,
+            ["-p", "no:cacheprovider", "-p", "no:hypothesispytest", "--color=no", *arguments],
+            cwd or folder,
+            XDG_RUNTIME_DIR=sockets,
+            PYTEST_ADDOPTS="",
+            COLUMNS="240",
         )
-    return Session(folder, done.returncode, done.stdout + done.stderr)
+    return Session(folder, done.returncode, done.stdout)
 
 
 def user_session(folder: Path, tests: str, *arguments: str) -> Session:

@@ -21,6 +21,7 @@ CONTRACT = Contract.load()
 PERIODS = 10_000
 FILES = {"result.json", "trace.csv", "bus.log", "picture.png"}
 RUN = ("run", "sine", "--mode", "inprocess", "--tuning", "paper")
+SHORT_RUN = (*RUN, "--duration", "0.3")
 
 
 @pytest.fixture(scope="module")
@@ -96,12 +97,12 @@ def test_a_run_leaves_nothing_of_an_earlier_one(tmp_path):
 
 
 def test_json_on_standard_output_is_the_file(tmp_path, capsys):
-    assert cli.main([*RUN, "--json", "--out", str(tmp_path)]) == 0
+    assert cli.main([*SHORT_RUN, "--json", "--out", str(tmp_path)]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / "result.json").read_text())
 
 
 def test_a_run_without_terminal_keeps_standard_error_clean(tmp_path):
-    ended = hil(*RUN, "--json", "--out", str(tmp_path))
+    ended = hil(*SHORT_RUN, "--json", "--out", str(tmp_path))
     assert (ended.returncode, ended.stderr) == (0, "")
     json.loads(ended.stdout)
 
@@ -155,7 +156,7 @@ def test_candump_lines_carry_bus_time(folder):
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".csv", ".mf4", ".trc", ".txt"])
 def test_every_log_format_is_written(tmp_path, suffix):
-    assert cli.main([*RUN, "--log", suffix, "--out", str(tmp_path)]) == 0
+    assert cli.main([*SHORT_RUN, "--log", suffix, "--out", str(tmp_path)]) == 0
     assert (tmp_path / f"bus{suffix}").stat().st_size > 1000
 
 
@@ -180,7 +181,7 @@ def test_the_picture_is_a_picture(folder):
 
 @pytest.mark.parametrize("controller", ["p", "pi"])
 def test_every_controller_gets_one(tmp_path, controller):
-    cli.main([*RUN, "--controller", controller, "--out", str(tmp_path)])
+    cli.main([*SHORT_RUN, "--controller", controller, "--out", str(tmp_path)])
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
@@ -199,9 +200,9 @@ def test_files_appear_only_when_all_are_there(tmp_path):
 
 
 def test_a_new_run_replaces_the_old_one(tmp_path):
-    assert cli.main([*RUN, "--out", str(tmp_path)]) == 0
+    assert cli.main([*SHORT_RUN, "--out", str(tmp_path)]) == 0
     old = (tmp_path / "trace.csv").read_text()
-    assert cli.main([*RUN, "--controller", "p", "--out", str(tmp_path)]) in (0, 1)
+    assert cli.main([*SHORT_RUN, "--controller", "p", "--out", str(tmp_path)]) in (0, 1)
     assert (tmp_path / "trace.csv").read_text() != old
     assert {file.name for file in tmp_path.iterdir()} == FILES
 
