@@ -71,9 +71,13 @@ def forked(
         os.environ.update(environment)
         for stream in (1, 2):
             os.dup2(words, stream)
-        sys.stdout = sys.__stdout__ = open(1, "w", buffering=1, closefd=False)
-        sys.stderr = sys.__stderr__ = open(2, "w", buffering=1, closefd=False)
-        sys.exit(program(list(arguments)))
+        with (
+            open(1, "w", buffering=1, closefd=False) as stdout,
+            open(2, "w", buffering=1, closefd=False) as stderr,
+        ):
+            sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__ = stdout, stderr
+            code = program(list(arguments))
+        sys.exit(code)
 
     with TemporaryFile("w+") as words:
         process = FORK.Process(target=main, args=(words.fileno(),))

@@ -67,7 +67,7 @@ def convert(source: Path, target: Path) -> None:
 
 @pytest.mark.parametrize("second", FORMATS)
 @pytest.mark.parametrize("first", FORMATS)
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(traffic=traffics())
 def test_a_log_written_in_one_format_and_read_in_another_has_the_same_frames(
     tmp_path, first, second, traffic
@@ -79,7 +79,7 @@ def test_a_log_written_in_one_format_and_read_in_another_has_the_same_frames(
     assert np.array_equal(kept(read_bus_log(target).traffic, first, second), kept(traffic, first, second))
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(traffic=traffics())
 def test_cantools_reads_the_frames_of_a_candump_log(tmp_path, traffic):
     path = tmp_path / "bus.log"

@@ -1,8 +1,10 @@
 """The bench in pytest, as its users run it: sessions of pytest in processes of their own."""
 
 import json
+import os
 import re
 import shlex
+import subprocess
 import sys
 import tomllib
 import xml.etree.ElementTree as ET
@@ -11,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from bench_runs import forked
+from bench_runs import SAFETY_NET_S, forked
 
 from hil.bench import Bench
 from hil.run.inprocess import InprocessRig
@@ -134,16 +136,13 @@ class Session:
         }
 
 
+QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest", "--color=no")
+
+
 def run_pytest(folder: Path, *arguments: str, cwd: Path | None = None) -> Session:
     with TemporaryDirectory() as sockets:  # a short path: a socket's has at most 107 characters
-        done = forked(
-            pytest.main,
-            ["-p", "no:cacheprovider", "-p", "no:hypothesispytest", "--color=no", *arguments],
-            cwd or folder,
-            XDG_RUNTIME_DIR=sockets,
-            PYTEST_ADDOPTS="",
-            COLUMNS="240",
-        )
+        settings = {"XDG_RUNTIME_DIR": sockets, "PYTEST_ADDOPTS": "", "COLUMNS": "240"}
+        done = forked(pytest.main, [*QUICK, *arguments], cwd or folder, **settings)
     return Session(folder, done.returncode, done.stdout)
 
 
@@ -181,8 +180,14 @@ def test_the_replay_command_replays_the_run_to_the_last_bit(session, tmp_path):
     program, module, pytest_, *arguments = shlex.split(command.removeprefix("replay: "))
     assert (program, module, pytest_) == (sys.executable, "-m", "pytest")
     result = session.folder / "out/pytest/test_user.test_fails/result.json"
-    again = run_pytest(session.folder, *arguments, f"--hil-out={tmp_path}")
-    assert again.code == 1
+    again = subprocess.run(
+        [program, module, pytest_, *arguments, f"--hil-out={tmp_path}"],
+        cwd=session.folder,
+        env=os.environ | {"PYTEST_ADDOPTS": ""},
+        stdout=subprocess.DEVNULL,
+        timeout=SAFETY_NET_S,
+    )
+    assert again.returncode == 1
     sha256 = json.loads(result.read_text())["bus_sha256"]
     assert json.loads((tmp_path / "test_user.test_fails/result.json").read_text())["bus_sha256"] == sha256
 

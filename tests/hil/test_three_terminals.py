@@ -6,13 +6,12 @@ Real time is slowed down so far that what is asserted outlives the stalls of a b
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from bench_runs import SAFETY_NET_S, background, busy_machine
+from bench_runs import SAFETY_NET_S, background, busy_machine, forked
 
 CHANNEL = "bench"
 RT_RATIO = "0.03"
@@ -65,18 +64,9 @@ def terminals(*names: str, ratio: str = RT_RATIO) -> Iterator[Terminals]:
 def scenarios(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """Run a user's scenarios against what is on the bus."""
     (folder / "test_mine.py").write_text(SCENARIOS)
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "test_mine.py",
-        "-p",
-        "no:cacheprovider",
-        "--hil-mode",
-        "realtime",
-    ]
-    command += ["--hil-interface", "hilbus", "--hil-channel", CHANNEL, "--rt-ratio", RT_RATIO, *options]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=3 * SAFETY_NET_S)
+    command = ["test_mine.py", "-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
+    command += ["--hil-mode", "realtime", "--hil-interface", "hilbus", "--hil-channel", CHANNEL]
+    return forked(pytest.main, [*command, "--rt-ratio", RT_RATIO, *options], folder)
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
