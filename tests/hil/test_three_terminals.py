@@ -6,6 +6,7 @@ Real time is slowed down so far that what is asserted outlives the stalls of a b
 import re
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -61,12 +62,31 @@ def terminals(*names: str, ratio: str = RT_RATIO) -> Iterator[Terminals]:
         yield started
 
 
-def scenarios(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run a user's scenarios against what is on the bus."""
+def session(folder: Path, *options: str) -> list[str]:
+    """Return the arguments of pytest for a user's scenarios against what is on the bus."""
     (folder / "test_mine.py").write_text(SCENARIOS)
-    command = ["test_mine.py", "-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
-    command += ["--hil-mode", "realtime", "--hil-interface", "hilbus", "--hil-channel", CHANNEL]
-    return forked(pytest.main, [*command, "--rt-ratio", RT_RATIO, *options], folder)
+    arguments = ["test_mine.py", "-p", "no:cacheprovider", "--hil-mode", "realtime"]
+    return [
+        *arguments,
+        "--hil-interface",
+        "hilbus",
+        "--hil-channel",
+        CHANNEL,
+        "--rt-ratio",
+        RT_RATIO,
+        *options,
+    ]
+
+
+def scenarios(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a user's scenarios, as from a terminal."""
+    command = [sys.executable, "-m", "pytest", *session(folder)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=3 * SAFETY_NET_S)
+
+
+def refused(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run pytest for what it says before a scenario begins."""
+    return forked(pytest.main, [*session(folder, *options), "-p", "no:hypothesispytest"], folder)
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
@@ -104,7 +124,7 @@ def test_they_do_on_a_busy_machine_too(tmp_path):
 )
 def test_one_line_says_which_side_is_missing_and_how_to_start_it(tmp_path, there, missing, module):
     with terminals(*there):
-        run = scenarios(tmp_path, "--hil-start-timeout", "2")
+        run = refused(tmp_path, "--hil-start-timeout", "2")
     assert run.returncode == 2
     (line,) = re.findall(r"hil: .*heard.*", run.stdout + run.stderr)
     assert line.startswith(f"hil: nothing was heard of the {missing} on hilbus channel '{CHANNEL}'")
@@ -114,7 +134,7 @@ def test_one_line_says_which_side_is_missing_and_how_to_start_it(tmp_path, there
 
 def test_one_line_says_that_the_bench_and_a_side_keep_different_time(tmp_path):
     with terminals("plant_sim", "firmware_py", ratio="0.1"):
-        run = scenarios(tmp_path)
+        run = refused(tmp_path)
     assert run.returncode == 2
     (line,) = re.findall(
         r"hil: the \w+ runs at --rt-ratio ([\d.e-]+), this bench at (\S+): ", run.stdout + run.stderr
