@@ -261,7 +261,7 @@ def _phase_of(resets_ns: np.ndarray, commands: np.ndarray, bit_rate: int) -> Tim
 
 def _latest_timer_ns(commands: np.ndarray, bit_rate: int) -> np.ndarray:
     """Return when the timer behind each command fired at the latest: it met an idle bus then."""
-    wire_ns = (traffic_bits(commands) - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
+    wire_ns = (traffic_bits(commands)[:, 0] - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
     latest_ns: np.ndarray = commands[:, 0].astype(np.int64) - wire_ns - EXECUTION_NS
     return latest_ns
 
