@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c clean
+.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c misra clean
 
 run: $(READY)  ## the main job: the 10 s sine under the robust ADRC, three processes in lock-step
 	$(BIN)/hil run sine
@@ -44,6 +44,10 @@ c: $(READY)  ## rewrite the exported C in firmware_py/c
 
 faults: $(READY)  ## play the fault matrix; rewrite it in docs/fault_matrix.md
 	$(BIN)/python tests/tools/fault_figures.py
+
+misra: $(READY)  ## the exported C against MISRA C:2012, deviations listed
+	command -v cppcheck >/dev/null || apt-get install --yes --quiet cppcheck
+	$(BIN)/python tests/tools/misra.py
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

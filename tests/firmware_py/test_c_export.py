@@ -104,7 +104,8 @@ def test_a_function_comes_behind_those_it_calls_and_none_that_is_not_called():
         ("def f(a: int32) -> None:\n    x = a * a\n", "snippet.py:3: product without 64-bit operands: a * a"),
         ("def f(a: int32) -> None:\n    register = a\n", "snippet.py:3: register means something else in C"),
         (
-            "def g() -> None:\n    return\ndef f(g: int32) -> None:\n    g = 1\n",
+            "def g() -> None:\n    return\ndef h(g: int32) -> None:\n    return\n"
+            "def f() -> None:\n    g()\n    h(1)\n",
             "snippet.py:4: g means something else in C",
         ),
         ("def g() -> None:\n    f()\ndef f() -> None:\n    g()\n", "recursion: g -> f -> g"),

@@ -91,6 +91,11 @@ def test_any_sequence_of_interrupts(programs, kernel_modules, data):
     assert_same(programs, kernel_modules, [*events, Event(TIMER)])
 
 
+def test_the_documented_size_is_that_of_the_memory():
+    page = EXPORTED.parents[1] / "docs" / "silicon.md"
+    assert f"/* {4 * WORDS} bytes, yours to place */" in page.read_text()
+
+
 # behind the node's interface, on the bench
 
 
