@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from dbc.frame import BRS_FLAG, EFF_FLAG, ERR_FLAG, ESI_FLAG, FD_FLAG, Frame
 from dbc.node import NOTHING, Actions
-from firmware_py.state_machine import State
+from firmware_py.diagnosis import State
 from hil import cli
 from hil.bench import Bench
 from hil.bus import link

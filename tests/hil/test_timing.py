@@ -452,14 +452,14 @@ def test_a_scenario_names_the_limits_it_wants(tmp_path):
     assert cut.timing == TimingLimits(), "as its other limits"
 
 
-ALLOWED = "allowed are feedback_age_us, jitter_us, late_periods, latency_us, missed_periods, setpoint_age_us"
+ALLOWED = "feedback_age_us, setpoint_age_us, latency_us, jitter_us, missed_periods, late_periods"
 
 
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("timing = 3\n", "timing must be a table of limits"),
-        ("[timing]\nlatency_ms = 1\n", "unknown key 'latency_ms' in timing"),
+        ("timing = 3\n", f"timing is 3, must be a table of limits: {ALLOWED}"),
+        ("[timing]\nlatency_ms = 1\n", f"unknown key 'latency_ms' in timing; allowed are {ALLOWED}"),
         ('[timing]\nlatency_us = "900"\n', "timing.latency_us is '900', must be a number of µs from 0 on"),
         ("[timing]\nlatency_us = -1\n", "timing.latency_us is -1, must be a number of µs from 0 on"),
         ("[timing]\njitter_us = nan\n", "timing.jitter_us is nan, must be a number of µs from 0 on"),
@@ -469,9 +469,11 @@ ALLOWED = "allowed are feedback_age_us, jitter_us, late_periods, latency_us, mis
     ],
 )
 def test_a_malformed_timing_table(tmp_path, text, what):
+    file = scenario_file(tmp_path, text)
     with pytest.raises(ScenarioError) as refused:
-        load_scenario(scenario_file(tmp_path, text))
-    assert str(refused.value) == f"mine: {what}; {ALLOWED}"
+        load_scenario(file)
+    line = GOOD.count("\n") + text.count("\n")
+    assert str(refused.value) == f"{file}: line {line}: {what}"
 
 
 def test_limits_that_are_met_are_in_the_result(tmp_path, capsys):
