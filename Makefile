@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c misra clean
+.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c elf cost misra clean
 
 run: $(READY)  ## the main job: the 10 s sine under the robust ADRC, three processes in lock-step
 	$(BIN)/hil run sine
@@ -41,6 +41,14 @@ figures: $(READY)  ## rewrite the figures in README from a new evaluation
 
 c: $(READY)  ## rewrite the exported C in firmware_py/c
 	$(BIN)/python -m firmware_py.c_export firmware_py/c
+
+elf: $(READY)  ## rebuild the Cortex-M images from firmware_py/c and firmware_py/target
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[arm]'
+	$(BIN)/python -m firmware_py.emulated.build
+
+cost: $(READY)  ## measure what the images cost; rewrite the figures in README and docs/silicon.md
+	$(BIN)/hil cost --write
+	$(BIN)/python tests/tools/cost_figures.py
 
 faults: $(READY)  ## play the fault matrix; rewrite it in docs/fault_matrix.md
 	$(BIN)/python tests/tools/fault_figures.py

@@ -5,6 +5,7 @@ import sys
 
 import hil.bus.mf4_on_demand  # noqa: F401  before python-can is imported
 from dbc.contract import Contract
+from firmware_py.chosen_firmware import add_firmware_argument, firmware_of_text
 from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from firmware_py.node import PHASE_NS, Controller
 from hil.bus.wire import Clock
@@ -18,9 +19,11 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m firmware_py", description=DESCRIPTION)
     add_node_arguments(parser)
     add_tuning_arguments(parser)
+    add_firmware_argument(parser)
 
     def build(arguments: argparse.Namespace) -> Controller:
-        return Controller(Contract.load(arguments.dbc), tuning_of(arguments).calibration.to_bytes())
+        contract, calibration = Contract.load(arguments.dbc), tuning_of(arguments).calibration
+        return firmware_of_text(arguments.firmware).controller(contract, calibration.to_bytes())
 
     return node_main(parser, build, Clock(PHASE_NS), argv)
 

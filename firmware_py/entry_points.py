@@ -56,6 +56,11 @@ def flash_calibration(memory: np.ndarray, words: Sequence[int]) -> None:
     memory[_CALIBRATION] = words
 
 
+def set_execution_time(memory: np.ndarray, share_0p5percent: int) -> None:
+    """Tell the firmware, once it has started, how long a control period takes."""
+    memory[_TASK][at.EXECUTION_TIME] = share_0p5percent
+
+
 @register_jitable
 def take_frame(memory, can_id, length, data):  # type: ignore[no-untyped-def]
     """Receive interrupt; `data` is a uint64."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from dbc.contract import Contract
 from dbc.frame import Frame
-from dbc.node import NOTHING, Actions, next_period
+from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
 from dbc.packet import NOT_ANSWERED, answer_by_entry_points
 from dbc.record import Record
 from firmware_py import entry_points
@@ -23,6 +23,11 @@ PHASE_NS = 500_000
 """How long after the sensor's sampling instant the controller's timer fires, ns."""
 
 
+def execution_time(execution_ns: int) -> int:
+    """Return an execution time as ControllerStatus has it: a share of the control period, 0.5 %."""
+    return -(-execution_ns * 200 // PERIOD_NS)
+
+
 class Controller:
     """The firmware: mailboxes, state machine, control kernel, transmit.
 
@@ -32,6 +37,8 @@ class Controller:
         The DBC.
     calibration_block : bytes
         As flashed; a damaged one keeps the controller in power-on.
+    execution_ns : int
+        From the timer to transmission.
 
     Attributes
     ----------
@@ -41,8 +48,11 @@ class Controller:
 
     name = "controller"
 
-    def __init__(self, contract: Contract, calibration_block: bytes) -> None:
+    def __init__(
+        self, contract: Contract, calibration_block: bytes, execution_ns: int = EXECUTION_NS
+    ) -> None:
         self._calibration_block = calibration_block
+        self._execution_ns = execution_ns
         received_ids = [message.can_id for message in received(contract)]
         self.accepts = frozenset({*received_ids, contract.bench_control.can_id})
         self.latched = self.accepts
@@ -52,7 +62,7 @@ class Controller:
         self._row = np.zeros(len(entry_points.RECORD_COLUMNS), np.int64)
         self._receive = partial(entry_points.receive, self._memory)
         self._period = partial(entry_points.period, self._memory, self._sends, self._row)
-        self._answer_timer = partial(answer_timer, self._memory, EXECUTION_NS)
+        self._answer_timer = partial(answer_timer, self._memory, execution_ns)
         self.record = Record(entry_points.RECORD_COLUMNS, np.int64)
 
     def on_start(self, now_ns: int) -> Actions:
@@ -63,6 +73,7 @@ class Controller:
             entry_points.flash_calibration(self._memory, calibration.words)
             law = calibration.law
         entry_points.power_on(self._memory, law)
+        entry_points.set_execution_time(self._memory, execution_time(self._execution_ns))
         return Actions(next_period(now_ns))
 
     def on_frame(self, now_ns: int, frame: Frame) -> Actions:
@@ -74,7 +85,7 @@ class Controller:
         """Timer interrupt: one control period."""
         count = self._period(now_ns)
         self.record.append(self._row)
-        send_ns = now_ns + EXECUTION_NS
+        send_ns = now_ns + self._execution_ns
         sends = tuple([(send_ns, Frame(*frame)) for frame in self._sends[:count].tolist()])
         return Actions(next_period(now_ns + 1), sends)
 

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from dbc.contract import ContractError
 from firmware_py.calibration import CalibrationError
+from firmware_py.chosen_firmware import FirmwareError, add_firmware_argument, firmware_of_text
 from firmware_py.chosen_tuning import DEFAULT_TUNING, add_tuning_arguments, tuning_of
 from firmware_py.tuning import TUNINGS
 from hil import inject_command
@@ -48,6 +49,7 @@ from hil.run.rigs import RIGS
 from hil.run.stopping import StopFlag, orphaned
 from hil.scenario import CONTROLLERS, ScenarioError, builtin_names, controller_of, load_scenario, too_late
 from hil.study import (
+    cost_command,
     faults_command,
     replay_command,
     reproduce,
@@ -71,6 +73,7 @@ REFUSALS = (
     can.CanInitializationError,
     ContractError,
     FaultError,
+    FirmwareError,
     LinkError,
     MatrixError,
     ParameterError,
@@ -78,8 +81,7 @@ REFUSALS = (
 )
 """What is wrong at the door: one line, exit code 2."""
 
-EXIT_CODES = """exit codes: 0 played and within the scenario's limits; 1 played, limits missed;
-2 wrong input or no answer; 3 a process was lost; 130 interrupted"""
+EXIT_CODES = "exit codes: 0 within limits, 1 not, 2 bad input, 3 process lost, 130 interrupted"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -120,6 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     laws = " ".join(CONTROLLERS)
     run.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (tuning's)")
     add_tuning_arguments(run)
+    add_firmware_argument(run)
     run.add_argument("--machine", metavar="K=V,...", help="differing machine: mass=1.5,leak=2 ...")
     run.add_argument(
         "--fault",
@@ -184,6 +187,7 @@ def _parser() -> argparse.ArgumentParser:
     reproduce.add_command(commands)
     replay_command.add_command(commands)
     rta_command.add_command(commands)
+    cost_command.add_command(commands)
 
     listing = commands.add_parser("list", help="list the built-in scenarios and tunings")
     listing.set_defaults(command=_list)
@@ -235,6 +239,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 scenario=scenario,
                 controller=arguments.controller or "",
                 tuning=tuning_of(arguments),
+                firmware=firmware_of_text(arguments.firmware),
                 record_directory=folder.scratch,
                 bit_rate=bit_rate,
                 data_bit_rate=arguments.data_bitrate,

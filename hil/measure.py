@@ -147,8 +147,10 @@ def figures_of(
 
 
 def setting_of(options: RigOptions) -> dict[str, Any]:
-    """Return the firmware's tuning and the plant's machine; None of a side that was started elsewhere."""
+    """Return the firmware, its tuning and the plant's machine; None of a side that was started elsewhere."""
+    firmware = {"name": options.firmware.name, "execution_us": options.firmware.execution_ns / 1e3}
     return {
+        "firmware": firmware if "controller" in options.started else None,
         "tuning": options.tuning.name if "controller" in options.started else None,
         "machine": asdict(options.machine) if "plant" in options.started else None,
     }
@@ -273,4 +275,5 @@ def timing_in(recording: Recording, trace: Trace, contract: Contract, bit_rate: 
         recording.start_ns,
         recording.start_ns + periods * PERIOD_NS,
         None if controller is None else controller["time_ns"] + PHASE_NS,
+        recording.execution_ns,
     )

@@ -225,6 +225,7 @@ def timing_of(
     start_ns: int,
     end_ns: int,
     timer_ns: np.ndarray | None = None,
+    execution_ns: int = EXECUTION_NS,
 ) -> Timing:
     """Return the timing of the control periods in a window.
 
@@ -240,7 +241,9 @@ def timing_of(
         Window in bus time; the whole periods in it count, what lies before and after does not.
     timer_ns : ndarray of int, optional
         Bus times at which the controller's timer fired, in any order. If omitted they are inferred: a
-        command's end less its time on the wire and the execution time, which is assumed.
+        command's end less its time on the wire and the execution time.
+    execution_ns : int
+        From the controller's timer to transmission, as assumed or measured.
     """
     feedback = _Frames(traffic, contract.position_feedback)
     setpoint = _Frames(traffic, contract.position_setpoint)
@@ -248,7 +251,7 @@ def timing_of(
     timer = RECORDED
     if timer_ns is None:
         timer = INFERRED
-        timer_ns = command.end_ns - command.duration_ns(bit_rate) - EXECUTION_NS
+        timer_ns = command.end_ns - command.duration_ns(bit_rate) - execution_ns
     timers_ns = np.sort(np.asarray(timer_ns, np.int64))
     first = -(-start_ns // PERIOD_NS)
     periods = max(end_ns // PERIOD_NS - first, 0)
@@ -262,7 +265,7 @@ def timing_of(
     newest_feedback = feedback.newest_at(timers_ns)
     newest_setpoint = setpoint.newest_at(timers_ns)
 
-    timer_of_command = _timer_of_each(command.end_ns, timers_ns)
+    timer_of_command = _timer_of_each(command.end_ns, timers_ns, execution_ns)
     known = np.flatnonzero(timer_of_command >= 0)
     made = known[inside(period_of_timer[timer_of_command[known]])]
     made_at = timer_of_command[made]
@@ -348,13 +351,13 @@ class _Frames:
         return f"{self._name} (counter {counter}) ended at {_at(self.end_ns[index])}"
 
 
-def _timer_of_each(command_end_ns: np.ndarray, timers_ns: np.ndarray) -> np.ndarray:
+def _timer_of_each(command_end_ns: np.ndarray, timers_ns: np.ndarray, execution_ns: int) -> np.ndarray:
     """Return the index of the timer that each command belongs to, -1 if there is none.
 
     That is the last one an execution time or more before the command's end. If several commands have the same
     one and there are timers without a command before it, the earlier commands were held up and are theirs.
     """
-    made_at = np.searchsorted(timers_ns, command_end_ns - EXECUTION_NS, side="right") - 1
+    made_at = np.searchsorted(timers_ns, command_end_ns - execution_ns, side="right") - 1
     taken, begin, group, count = np.unique(
         made_at, return_index=True, return_inverse=True, return_counts=True
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS, Node
-from firmware_py.node import PHASE_NS, Controller
+from firmware_py.node import PHASE_NS
 from hil.bus import link
 from hil.bus.agenda import Agenda
 from hil.bus.wire import DEFAULT_DATA_BIT_RATE, Clock, Port, Wire
@@ -57,7 +57,7 @@ class InprocessRig(Rig):
     def _begin(self, supervisor: Supervisor, bit_rate: int) -> "VirtualSession":
         machine, tuning = self.options.machine, self.options.tuning
         plant = Plant(self.contract, machine.parameters, machine.sensor(), machine.delay_periods)
-        firmware = Controller(self.contract, tuning.calibration.to_bytes())
+        firmware = self.options.firmware.controller(self.contract, tuning.calibration.to_bytes())
 
         def records() -> Records:
             return {node.name: node.record.columns_by_name() for node in (plant, firmware)}
@@ -149,6 +149,7 @@ class VirtualSession:
             startup_s=self._startup_s,
             ending=self.ending,
             broken=self.broken,
+            execution_ns=self._options.firmware.execution_ns,
             payloads=self.wire.payloads,
             data_bit_rate=self.wire.data_bit_rate,
             notes=self._notes(),

@@ -32,7 +32,7 @@ def side_arguments(name: str, options: RigOptions, bus: BusSettings) -> list[str
     if name == "controller":
         block = options.record_directory / "calibration.bin"
         block.write_bytes(options.tuning.calibration.to_bytes())
-        arguments = ["--calibration", str(block)]
+        arguments = ["--calibration", str(block), "--firmware", options.firmware.text]
     arguments += ["-i", bus.interface, "-c", bus.channel, "--rt-ratio", str(options.rt_ratio)]
     arguments += ["--record", str(options.record_directory), "--parent", str(os.getpid())]
     if bus.bit_rate is not None:

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware_py.chosen_firmware import ChosenFirmware
 from firmware_py.chosen_tuning import ChosenTuning, chosen_tuning
+from firmware_py.node import EXECUTION_NS
 from hil.bus.wire import DEFAULT_DATA_BIT_RATE
 from hil.run.stopping import StopFlag
 from hil.scenario import Scenario, controller_of
@@ -70,6 +72,8 @@ class RigOptions:
         What the plant is.
     tuning : ChosenTuning
         What the firmware is calibrated with.
+    firmware : ChosenFirmware
+        What runs it.
     bit_rate : int or None
         Bit/s; None is `DEFAULT_BIT_RATE` on a simulated wire, and on an adapter what python-can's
         configuration or the adapter itself says.
@@ -92,6 +96,7 @@ class RigOptions:
     record_directory: Path
     machine: Machine = field(default_factory=Machine)
     tuning: ChosenTuning = field(default_factory=chosen_tuning)
+    firmware: ChosenFirmware = field(default_factory=ChosenFirmware)
     bit_rate: int | None = None
     data_bit_rate: int = DEFAULT_DATA_BIT_RATE
     dbc: Path | None = None
@@ -162,6 +167,8 @@ class Recording:
         What the rows of `traffic` have no room for.
     data_bit_rate : int
         Bit/s of CAN FD data.
+    execution_ns : int
+        The firmware's, from its timer to transmission.
     notes : dict
         What only some modes have: frames injected, drops, lateness.
     """
@@ -178,4 +185,5 @@ class Recording:
     broken: bool = False
     payloads: np.ndarray = field(default_factory=lambda: np.zeros((0, 8), np.uint64))
     data_bit_rate: int = DEFAULT_DATA_BIT_RATE
+    execution_ns: int = EXECUTION_NS
     notes: dict[str, object] = field(default_factory=dict)

@@ -236,6 +236,7 @@ class RealtimeSession:
             startup_s=self._startup_s,
             ending=self.ending,
             broken=self.broken,
+            execution_ns=options.firmware.execution_ns,
             payloads=self._rig.listener.payloads,
             data_bit_rate=options.data_bit_rate,
             notes={

@@ -1,0 +1,112 @@
+"""``hil cost``: what the firmware costs on its processors."""
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from dbc.node import PERIOD_NS
+from firmware_py.chosen_firmware import COST
+from hil.run.options import BenchError
+
+DESCRIPTION = """Instructions are counted in an emulator and exact. Cycles are an estimate from the reference
+manuals of Arm, a range, with zero wait states; worst is the worst seen, not a bound."""
+
+_WIDTH = 140
+
+
+def add_command(commands: Any) -> None:
+    """Add ``cost`` to the command line."""
+    parser = commands.add_parser(
+        "cost", help="what the firmware costs on a Cortex-M", description=DESCRIPTION
+    )
+    parser.set_defaults(command=cost)
+    parser.add_argument("--measure", action="store_true", help="measure instead of showing what was measured")
+    parser.add_argument(
+        "--write", action="store_true", help="measure, and keep it as the figures to compare with"
+    )
+    parser.add_argument(
+        "--periods", type=int, default=10_000, metavar="N", help="of the sine (default 10000)"
+    )
+    parser.add_argument("--clock-mhz", type=float, metavar="F", help="for the share of the period")
+    parser.add_argument("--json", action="store_true", help="print all figures")
+
+
+def cost(arguments: argparse.Namespace) -> int:
+    """Show the bill."""
+    if arguments.measure or arguments.write:
+        from firmware_py.emulated.build import BuildError
+        from hil.study.cost import bill, compilers_bill
+
+        def progress(what: str) -> None:
+            print(f"hil: {what}", file=sys.stderr)
+
+        figures = bill(arguments.periods, progress)
+        if arguments.write:
+            try:
+                figures["compilers"] = compilers_bill(arguments.periods, progress)
+            except BuildError as error:
+                raise BenchError(str(error)) from error
+            COST.write_text(json.dumps(figures, indent=1) + "\n")
+    else:
+        figures = json.loads(COST.read_text())
+    if arguments.json:
+        print(json.dumps(figures, indent=1))
+    else:
+        Console(width=max(Console().width, _WIDTH)).print(_table(figures, arguments.clock_mhz))
+    return 0
+
+
+def rows(figures: dict[str, Any], clock_mhz: float | None = None) -> list[tuple[str, ...]]:
+    """Return the bill as rows of text: processor, controller, then the figures under `HEADINGS`."""
+    table: list[tuple[str, ...]] = []
+    for processor, one in figures["processors"].items():
+        clock = clock_mhz or one["clock_mhz"]
+        cycles = clock * PERIOD_NS * 1e-3
+        for controller, bill in one["controllers"].items():
+            step, timer = bill["step"], bill["timer"]
+            worst = max((step[name]["worst_cycles"] for name in step), key=lambda cycles: cycles[1])
+            period = max((timer[name]["worst_cycles"] for name in timer), key=lambda cycles: cycles[1])
+            table.append(
+                (
+                    f"{processor}, {clock:g} MHz",
+                    controller,
+                    f"{step['sine']['mean_instructions']:.0f}",
+                    f"{step['sine']['worst_instructions']}",
+                    f"{step['jumps']['worst_instructions']}",
+                    "{}-{}".format(*step["sine"]["worst_cycles"]),
+                    "{}-{}".format(*worst),
+                    f"{100 * worst[1] / cycles:.2f}",
+                    f"{timer['sine']['mean_instructions']:.0f}",
+                    "{}-{}".format(*period),
+                    f"{100 * period[1] / cycles:.2f}",
+                )
+            )
+    return table
+
+
+HEADINGS = (
+    "processor",
+    "law",
+    "law alone: instructions, mean of the sine",
+    "worst of the sine",
+    "worst of jumps",
+    "cycles, worst of the sine",
+    "worst seen",
+    "% of 1 ms",
+    "whole period: instructions, mean of the sine",
+    "cycles, worst seen",
+    "% of 1 ms",
+)
+
+
+def _table(figures: dict[str, Any], clock_mhz: float | None) -> Table:
+    table = Table(title=f"{figures['compiler']}; cycles are an estimate")
+    for number, heading in enumerate(HEADINGS):
+        table.add_column(heading, justify="left" if number < 2 else "right")
+    for row in rows(figures, clock_mhz):
+        table.add_row(*row)
+    return table
