@@ -1,7 +1,6 @@
 """The firmware's entry points as machine code: power-on, receive and timer interrupt."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numba.extending import register_jitable
@@ -65,8 +64,8 @@ def set_execution_time(memory: np.ndarray, share_0p5percent: int) -> None:
 def take_frame(memory, can_id, length, data):  # type: ignore[no-untyped-def]
     """Receive interrupt; `data` is a uint64."""
     contract, mailboxes, words = memory[_CONTRACT], memory[_MAILBOXES], memory[_TASK]
-    payload: Any = np.int64(data)
-    low, high = low32(payload), low32(payload >> 32)
+    low = low32(np.int64(data & np.uint64(0xFFFF_FFFF)))  # type: ignore[arg-type]
+    high = low32(np.int64(data >> np.uint64(32)))  # type: ignore[arg-type]
     task.receive(contract, mailboxes, words, low32(can_id), length, low, high)
 
 

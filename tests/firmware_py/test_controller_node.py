@@ -17,8 +17,12 @@ from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING
+from firmware_py import task
+from firmware_py import task_layout as at
+from firmware_py.contract_words import contract_words
 from firmware_py.diagnosis import Fault, State
-from firmware_py.kernel.layout import LAW_ADRC, LAW_PI
+from firmware_py.kernel import layout as k
+from firmware_py.kernel.layout import FLAG_SPEED_LIMITED, LAW_ADRC, LAW_PI
 from firmware_py.node import EXECUTION_NS, Controller
 from firmware_py.tuning import Tuning
 
@@ -215,6 +219,31 @@ def test_the_law_asked_for_is_taken_over_in_standby_only(running):
     assert controller_status(running)["ControlLaw"] == "PI"
 
 
+@pytest.mark.parametrize(("law", "name"), enumerate(("P", "PI", "ADRC", "PI_FF", "Scheduled"), start=1))
+def test_each_law_asked_for_is_reported(law, name):
+    assert controller_status(run(set_inputs(Rig(), law=law)))["ControlLaw"] == name
+
+
+def test_before_the_first_run_the_calibrations_law_is_reported(standby):
+    assert controller_status(standby)["ControlLaw"] == "ADRC"
+
+
+def test_law_zero_moves_as_the_calibrations_own_does():
+    velocities = []
+    for law in (0, LAW_ADRC):
+        rig = run(set_inputs(Rig(), law=law))
+        set_inputs(rig, setpoint_0p1um=10 * POSITION_UM + 1000)
+        velocities.append([rig.period().target_velocity for _ in range(20)])
+    assert velocities[0] == velocities[1]
+    assert any(velocities[0])
+
+
+def test_no_command_yet_is_no_command_without_enable():
+    rig = set_inputs(Rig(), enable=1)
+    rig.periods(20, command="lost")
+    assert rig.periods(20).state == State.STANDBY
+
+
 def test_law_zero_asks_for_the_calibrations_own():
     rig = set_inputs(Rig(), law=0)
     assert controller_status(run(rig))["ControlLaw"] == "ADRC"
@@ -317,6 +346,21 @@ def test_two_bad_periods_are_tolerated_again_and_again(running, message, damage)
     for _ in range(20):
         running.periods(2, **{message: damage})
         assert running.period() == (ENABLE_OPERATION, 0, State.RUN, 0)
+
+
+@pytest.mark.parametrize(
+    ("damage", "inputs"),
+    [({"feedback": "lost"}, {}), ({}, {"enable": 0}), ({}, {"statusword": READY})],
+    ids=["safe", "standby", "drive left"],
+)
+def test_a_moving_machine_is_told_to_stand_still_as_soon_as_it_may_not_run(running, damage, inputs):
+    set_inputs(running, setpoint_0p1um=10 * POSITION_UM + 5000)
+    assert running.periods(50).target_velocity > 0
+    set_inputs(running, **inputs)
+    outputs = [running.period(**damage) for _ in range(5)]
+    stopped = [output for output in outputs if output.state != State.RUN]
+    assert len(stopped) >= 3
+    assert {output.target_velocity for output in stopped} == {0}
 
 
 IMPLAUSIBLE = [
@@ -458,6 +502,18 @@ def test_a_bench_reset_forgets_everything(running):
     assert controller_status(running)["MailboxOverruns"] == 0
 
 
+def test_after_a_bench_reset_nothing_of_the_control_law_is_left(running):
+    set_inputs(running, setpoint_0p1um=10 * POSITION_UM + 5000, law=LAW_PI)
+    running.periods(20)
+    row = {name: values[-1] for name, values in running.controller.record.columns_by_name().items()}
+    assert all(row[name] for name in ("setpoint_0p1um", "position_um", "flags", "v1", "v2", "z1"))
+    bench = CONTRACT.bench_control
+    running.hear(bench.frame(bench.pack(BenchCommand.RESET, 123, -456)))
+    running.timer()
+    row = {name: values[-1] for name, values in running.controller.record.columns_by_name().items()}
+    assert {name for name, value in row.items() if value} == {"time_ns", "state", "faults"}
+
+
 def test_what_comes_after_a_bench_reset_in_the_same_period_is_not_forgotten(running):
     """A timer that is late finds the reset, and what was sent after it, at once."""
     bench = CONTRACT.bench_control
@@ -521,6 +577,49 @@ def test_the_observers_seven_pages_go_round_one_per_10_ms(running):
     assert {later - earlier for earlier, later in itertools.pairwise(cycles)} == {10}
 
 
+def test_each_period_sends_its_command_and_in_their_turn_status_and_observer():
+    rig = run(Rig())
+    rig.controller.on_start(rig.now_ns)
+    command, status, observer = (
+        CONTRACT.drive_command.can_id,
+        CONTRACT.controller_status.can_id,
+        CONTRACT.observer_state.can_id,
+    )
+    for period in range(250):
+        rig.period()
+        due = [command, *[status] * (period % 100 == 0), *[observer] * (period % 10 == 7)]
+        assert [frame.can_id for _, frame in rig.sent] == due
+
+
+def test_the_pages_are_the_states_of_their_period(running):
+    set_inputs(running, setpoint_0p1um=10 * POSITION_UM + 5000)
+    seen = {}
+    for _ in range(140):
+        running.period()
+        row = {name: values[-1] for name, values in running.controller.record.columns_by_name().items()}
+        for _, frame in running.sent:
+            if frame.can_id == CONTRACT.observer_state.can_id:
+                page, _, value = CONTRACT.observer_state.unpack(frame.data)
+                seen[page] = value
+                assert value == row[("v1", "v2", "v3", "z1", "z2", "z3", "z4")[page]]
+    assert len(set(seen.values())) == 7
+
+
+@pytest.mark.parametrize(
+    ("overruns", "reported"),
+    [((1, 2, 3, 4), 10), ((65_530, 4, 0, 0), 65_534), ((65_530, 0, 5, 0), 65_535), ((65_535,) * 4, 65_535)],
+)
+def test_the_count_of_overruns_stops_at_its_largest(overruns, reported):
+    contract, mailboxes = contract_words(CONTRACT).tolist(), [0] * at.MAILBOXES_SIZE
+    for number, count in enumerate(overruns):
+        mailboxes[number * at.MAILBOX_SIZE + at.OVERRUNS] = count
+    frames = [0] * at.FRAMES_SIZE
+    task.send_status(contract, mailboxes, [0] * at.TASK_SIZE, [0] * k.IO_SIZE, frames, at.FRAME_SIZE)
+    low, high = (word & 0xFFFF_FFFF for word in frames[at.FRAME_SIZE :][at.FRAME_LOW : at.FRAME_HIGH + 1])
+    payload = (high << 32 | low).to_bytes(8, "little")
+    assert DATABASE.decode_message("ControllerStatus", payload)["MailboxOverruns"] == reported
+
+
 def test_the_status_shows_the_assumed_execution_time(running):
     assert controller_status(running)["ExecutionTime"] == EXECUTION_NS / PERIOD_NS * 100.0
 
@@ -566,6 +665,23 @@ def test_limited_periods_are_counted(running):
     assert controller_status(running)["Saturations"] == 0
     set_inputs(running, position_um=400_000)  # 0.3 m away, and the limiter only tempers the setpoint
     assert controller_status(running)["Saturations"] > 0
+    running.periods(99)
+    counted = controller_status(running)["Saturations"]
+    flags = running.controller.record.columns_by_name()["flags"]
+    assert counted == (flags & FLAG_SPEED_LIMITED).sum() > 1
+
+
+def test_the_count_of_limited_periods_stops_at_its_largest():
+    words, state, io = [0] * at.TASK_SIZE, [0] * k.ST_SIZE, [0] * k.IO_SIZE
+    mailboxes, calibration = [0] * at.MAILBOXES_SIZE, list(Tuning().calibration().words)
+    mailboxes[at.COMMAND_LAW], calibration[k.CAL_U_LIMIT] = LAW_PI, 1
+    mailboxes[at.SETPOINT_POSITION] = 4_000_000
+    words[at.SATURATIONS] = at.COUNT_MAX - 1
+    counts = []
+    for _ in range(3):
+        task.control(mailboxes, words, calibration, state, io, int(not counts))
+        counts.append(words[at.SATURATIONS])
+    assert counts == [at.COUNT_MAX] * 3
 
 
 # integers only

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from dbc import profile2
 from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from dbc.frame import Frame
@@ -16,48 +17,55 @@ CONTRACT = Contract.load()
 FEEDBACK = CONTRACT.position_feedback
 COMMAND = CONTRACT.controller_command
 SENSOR_OK, SENSOR_BROKEN = 0, 3
+BEGIN = 50
+OTHERS = [99] * BEGIN
+"""What lies around the mailbox, and around what is expected of it."""
 
 
 class Mailbox:
     """One of the controller's mailboxes, on checked integers."""
 
     def __init__(self, message: MessageCodec[..., Any] = FEEDBACK, **plausible: tuple[int, int]) -> None:
-        self._expected = checked.CheckedArray(expectation(message, plausible))
-        self._words = checked.CheckedArray([0] * at.MAILBOX_SIZE)
+        self._expected = checked.CheckedArray([*OTHERS, *expectation(message, plausible), *OTHERS])
+        self._words = checked.CheckedArray([99] * (len(OTHERS) + at.MAILBOX_SIZE + len(OTHERS)))
         self._functions = FIRMWARE["mailbox"]
-        self._functions.clear(self._words, 0, self._expected, 0)
+        self._functions.clear(self._words, BEGIN, self._expected, BEGIN)
 
     def period(self, *frames: Frame | None) -> None:
         """Receive frames, then poll."""
         for frame in frames:
             if frame is not None:
                 low, high = map(checked.low32, map(checked.i64, (frame.data, frame.data >> 32)))
-                self._functions.take(self._words, 0, frame.dlc, low, high)
-        self._functions.poll(self._words, 0, self._expected, 0)
+                self._functions.take(self._words, BEGIN, frame.dlc, low, high)
+        self._functions.poll(self._words, BEGIN, self._expected, BEGIN)
+        assert self._words[:BEGIN] == self._words[-BEGIN:] == OTHERS
+
+    def word(self, index: int) -> int:
+        return int(self._words[BEGIN + index])
 
     @property
     def position(self) -> int:
-        return int(self._words[at.VALUES + 1])
+        return self.word(at.VALUES + 1)
 
     @property
     def is_new(self) -> bool:
-        return bool(self._words[at.IS_NEW])
+        return bool(self.word(at.IS_NEW))
 
     @property
     def stale(self) -> bool:
-        return bool(self._words[at.STALE])
+        return bool(self.word(at.STALE))
 
     @property
     def corrupt(self) -> bool:
-        return bool(self._words[at.CORRUPT])
+        return bool(self.word(at.CORRUPT))
 
     @property
     def invalid(self) -> bool:
-        return bool(self._words[at.INVALID])
+        return bool(self.word(at.INVALID))
 
     @property
     def overruns(self) -> int:
-        return int(self._words[at.OVERRUNS])
+        return self.word(at.OVERRUNS)
 
 
 class Sender:
@@ -230,3 +238,48 @@ def test_a_message_of_100_ms_is_stale_after_300():
         assert not mailbox.stale
     mailbox.period(None)
     assert mailbox.stale
+
+
+def test_age_and_overruns_stop_where_they_no_longer_matter(sender):
+    mailbox = Mailbox()
+    for _ in range(20):
+        mailbox.period(None)
+    assert mailbox.word(at.AGE) == 3
+    mailbox._words[BEGIN + at.OVERRUNS] = at.COUNT_MAX - 1
+    mailbox.period(*[sender.good() for _ in range(4)])
+    assert mailbox.overruns == at.COUNT_MAX
+
+
+def test_an_unsigned_signal_is_unsigned_whatever_its_plausible_range(sender):
+    mailbox = Mailbox(sensor_status=(1, 255))
+    for _ in range(2):
+        mailbox.period(sender.good(SENSOR_BROKEN))
+    assert (mailbox.is_new, mailbox.word(at.VALUES)) == (True, SENSOR_BROKEN)
+
+
+@pytest.mark.parametrize("late", [1, 50, 99])
+def test_a_slow_message_is_missed_once_in_each_cycle_since_it_was_valid(late):
+    mailbox, protector = Mailbox(COMMAND), COMMAND.protector()
+
+    def missed() -> int:
+        return mailbox.word(profile2.NO_NEW_OR_REPEATED_DATA_COUNTER)
+
+    def frame() -> Frame:
+        return COMMAND.frame(protector.protect(COMMAND.pack(1, 3, 0)))
+
+    mailbox.period(frame())
+    for _ in range(late):
+        mailbox.period(None)
+    mailbox.period(frame())
+    assert (mailbox.is_new, missed()) == (True, 0)
+    for period in range(1, 450):
+        mailbox.period(None)
+        assert missed() == period // 100
+
+
+def test_receiving_between_polls_counts_as_one_check(sender):
+    mailbox = Mailbox()
+    mailbox.period(sender.good())
+    mailbox.period(sender.missing())
+    assert mailbox.word(profile2.NO_NEW_OR_REPEATED_DATA_COUNTER) == 1
+    assert mailbox.word(at.ARRIVED) == 0
