@@ -9,7 +9,7 @@ ROOT = HERE.parents[1]
 ENVIRONMENT = {"NUMBA_DISABLE_JIT": "1", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1"}
 """What makes the tests run our sources interpreted, the same each time."""
 
-PYTEST_OPTIONS = ("-q", "-p", "no:hil", "-p", "no:cacheprovider", "-W", "ignore")
+PYTEST_OPTIONS = ("-q", "-pno:hil", "-pno:cacheprovider", "-Wignore")
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 import pytest
 from cantools.autosar import compute_profile2_crc
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dbc import profile2
@@ -196,10 +196,15 @@ def in_words(payload):
 
 
 @given(
-    events=st.lists(st.integers(0, 15) | st.sampled_from([NOTHING, CORRUPT]), max_size=60),
+    steps=st.lists(st.sampled_from([1, 1, 1, 1, 0, 2, 6, 9, NOTHING, CORRUPT]), max_size=60),
     limits=st.tuples(st.integers(0, 3), st.integers(0, 4), st.integers(0, 2)),
 )
-def test_state_and_configuration_may_lie_anywhere_among_other_words(events, limits):
+@example(steps=[1, 9, 1, 1, 1, 1], limits=(1, 3, 2))
+def test_state_and_configuration_may_lie_anywhere_among_other_words(steps, limits):
+    counter, events = 0, []
+    for step in steps:
+        counter = counter + step & 15 if isinstance(step, int) else counter
+        events.append(counter if isinstance(step, int) else step)
     names = ("max_delta_counter_init", "max_no_new_or_repeated_data", "sync_counter_init")
     expected = statuses(events, **dict(zip(names, limits, strict=True)))
     others = [99] * 32
