@@ -440,7 +440,7 @@ def test_a_column_without_length_has_no_stiffness(length, expected):
     assert schedule.column(5, length) == expected
 
 
-@pytest.mark.parametrize("ratio", [-1, 0, 1, 2, 131_071, 131_072, 131_073, 2**24, HIGH])
+@pytest.mark.parametrize("ratio", [-1, 0, 1, 2, 131_071, 131_072, 131_073, 2**24, 22_253_377, HIGH])
 def test_softness_is_the_reciprocal(ratio):
     assert schedule.softness(ratio) == (clip(2**48 // ratio) if ratio > 0 else 0)
 
