@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    from firmware_py.chosen_firmware import ChosenFirmware
     from firmware_py.chosen_tuning import ChosenTuning
     from hil.bench import Bench
     from hil.run.rig import Rig
@@ -70,6 +71,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     group.addoption("--hil-start-timeout", type=float, default=120.0, metavar="S", help="default 120 s")
     group.addoption("--rt-ratio", default="1", metavar="R", help="realtime: 0.1 is ten times slower")
+    group.addoption(
+        "--hil-firmware", default="python", metavar="NAME,K=V", help="python, cortex-m4,clock_mhz=168 ..."
+    )
     group.addoption("--hil-bitrate", type=int, metavar="B", help="bit/s (default 1000000)")
     group.addoption(
         "--hil-out", type=Path, default=Path("out/pytest"), metavar="DIR", help="default out/pytest"
@@ -248,9 +252,19 @@ def _new_rig(config: pytest.Config, directory: Path, machine: "Machine", tuning:
         started=frozenset(_started(config)),
         machine=machine,
         tuning=tuning,
+        firmware=_firmware(config),
         start_timeout_s=config.getoption("hil_start_timeout"),
     )
     return RIGS[config.getoption("hil_mode")](options)
+
+
+def _firmware(config: pytest.Config) -> "ChosenFirmware":
+    from firmware_py.chosen_firmware import FirmwareError, firmware_of_text
+
+    try:
+        return firmware_of_text(config.getoption("hil_firmware"))
+    except FirmwareError as error:
+        raise pytest.UsageError(f"--hil-firmware: {error}") from error
 
 
 def _ratio(config: pytest.Config) -> Fraction:
@@ -287,7 +301,15 @@ def _replay_command(item: pytest.Item) -> str:
     """Return the command line that runs one test again as it ran."""
     given = [argument for argument in item.config.invocation_params.args if str(argument).startswith("-")]
     options = []
-    for option in ("hil-mode", "hil-interface", "hil-channel", "hil-start", "rt-ratio", "hil-bitrate"):
+    for option in (
+        "hil-mode",
+        "hil-interface",
+        "hil-channel",
+        "hil-start",
+        "hil-firmware",
+        "rt-ratio",
+        "hil-bitrate",
+    ):
         value = item.config.getoption(option.replace("-", "_"))
         if value is not None and any(str(argument).startswith(f"--{option}") for argument in given):
             options.append(f"--{option}={value}")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from firmware_py.calibration import Calibration
-from firmware_py.emulated.build import build, compiler_version
+from firmware_py.emulated.build import BuildError, build, compiler_version
 from firmware_py.emulated.cycles import Cost
 from firmware_py.emulated.image import MANIFEST, Image, reference_image
 from firmware_py.emulated.machine import Machine
@@ -143,17 +143,15 @@ def bill(periods: int, progress: Callable[[str], None]) -> dict[str, Any]:
 
 
 def compilers_bill(periods: int, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Return the law ADRC built by each compiler that is installed.
-
-    Raises
-    ------
-    firmware_py.emulated.build.BuildError
-        If a compiler is not installed.
-    """
+    """Return what ADRC costs as built by each compiler that is installed; see `bill` for the parameters."""
     sine, jumps = sine_inputs("ADRC", periods), jump_inputs()
     built: dict[str, Any] = {}
     for compiler, optimisation in BUILDS:
-        name = f"{compiler_version(compiler)} {optimisation}"
+        try:
+            name = f"{compiler_version(compiler)} {optimisation}"
+        except BuildError as error:
+            progress(f"{compiler} left out: {error}")
+            continue
         built[name] = {}
         for processor in TARGETS:
             progress(f"{processor}, {name}")
