@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c elf cost misra clean
+.PHONY: run reproduce test test-long test-vcan coverage mutation check bench figures c faults elf cost misra clean
 
 run: $(READY)  ## the main job: the 10 s sine under the robust ADRC, three processes in lock-step
 	$(BIN)/hil run sine
