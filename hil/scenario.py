@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import resources
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from hil.faults.catalogue import fault_of_table
 from hil.faults.fault import LONGEST_S, Fault, FaultError
 from hil.faults.machine import MAX_LOAD_N
 from hil.references import REFERENCES
-from hil.toml_lines import Path, line_of
+from hil.toml_lines import KeyPath, line_of
 from plant_sim.machine import Machine
 from plant_sim.parameters import ParameterError
 
@@ -133,7 +133,7 @@ class Scenario:
 def builtin_names() -> list[str]:
     """Return the names of the scenarios in the package."""
     files = resources.files("hil.scenarios").iterdir()
-    return sorted(FilePath(file.name).stem for file in files if file.name.endswith(".toml"))
+    return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
 
 
 def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
@@ -153,12 +153,12 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
         If there is none of that name, or a key is missing, unknown or has a wrong value.
     """
     if name.endswith(".toml"):
-        path = FilePath(name)
+        path = Path(name)
         if not path.is_file():
             raise ScenarioError(f"there is no scenario file {name}")
         text = path.read_text(encoding="utf-8", errors="replace")
     elif name in builtin_names():
-        path = FilePath(name)
+        path = Path(name)
         text = resources.files("hil.scenarios").joinpath(f"{name}.toml").read_text(encoding="utf-8")
     else:
         known = ", ".join(builtin_names())
@@ -183,7 +183,7 @@ def load_scenario(name: str, duration_s: float | None = None) -> Scenario:
 class _WrongKeyError(ScenarioError):
     """What is wrong, and where in the file; a key that is missing is looked for in its table."""
 
-    def __init__(self, path: Path, message: str) -> None:
+    def __init__(self, path: KeyPath, message: str) -> None:
         super().__init__(message)
         self.path = path
 
@@ -210,7 +210,9 @@ def _checked(name: str, content: dict[str, Any]) -> Scenario:
     )
 
 
-def _known(table: dict[str, Any], path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+def _known(
+    table: dict[str, Any], path: KeyPath, required: Sequence[str], optional: Sequence[str] = ()
+) -> None:
     """Make sure that a table has the keys it needs, and no others."""
     within = f" in {_dotted(path)}" if path else ""
     allowed = ", ".join([*required, *optional])
@@ -222,11 +224,11 @@ def _known(table: dict[str, Any], path: Path, required: Sequence[str], optional:
             raise _WrongKeyError(path, f"missing key {key!r}{within}; needed are {', '.join(required)}")
 
 
-def _dotted(path: Path) -> str:
+def _dotted(path: KeyPath) -> str:
     return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).lstrip(".")
 
 
-def _table(value: Any, path: Path, of_what: str) -> dict[str, Any]:
+def _table(value: Any, path: KeyPath, of_what: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise _WrongKeyError(path, f"{_dotted(path)} is {value!r}, must be a table {of_what}")
     return value
@@ -304,7 +306,7 @@ def too_late(fault: Fault, duration_s: float) -> str:
     return f"{fault.kind}: at_s is {fault.at_s}, must be below duration_s, {duration_s:g} s"
 
 
-def _fault(value: Any, path: Path) -> Fault:
+def _fault(value: Any, path: KeyPath) -> Fault:
     table = _table(value, path, "[[fault]]")
     try:
         return fault_of_table(table)

@@ -3,11 +3,11 @@
 import tomllib
 from typing import Any
 
-Path = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
 """Keys, and indices into arrays of tables, from the top of the text down."""
 
 
-def line_of(text: str, path: Path) -> int | None:
+def line_of(text: str, path: KeyPath) -> int | None:
     """Return the line (1, 2, ...) on which a key, table or element of an array of tables begins.
 
     None if it is not in the text. A text cut after the key's value has the key, one cut before has not, and
@@ -26,7 +26,7 @@ def line_of(text: str, path: Path) -> int | None:
     return None
 
 
-def _has(content: Any, path: Path) -> bool:
+def _has(content: Any, path: KeyPath) -> bool:
     for key in path:
         try:
             content = content[key]

@@ -5,7 +5,16 @@ from typing import ClassVar
 
 from dbc.frame import Frame
 from hil.bus.wire import FrameFault
-from hil.faults.fault import LONGEST_S, FaultError, LastingWireFault, Stage, WireFault, choice, number
+from hil.faults.fault import (
+    LONGEST_S,
+    FaultError,
+    LastingWireFault,
+    Stage,
+    WireFault,
+    choice,
+    number,
+    whole_ns,
+)
 from hil.faults.names import NODES, SIDES, messages
 
 
@@ -49,7 +58,7 @@ class Delay(FrameFaultBase):
     @property
     def argument(self) -> int:
         """The delay, ns."""
-        return round(self.delay_s * 1e9)
+        return whole_ns(self.delay_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +118,7 @@ class BitErrors(WireFault):
 
     def begin(self, stage: Stage) -> None:
         """Let there be noise."""
-        self.wire(stage).disturb(self.rate, round(self.duration_s * 1e9), self.seed)
+        self.wire(stage).disturb(self.rate, whole_ns(self.duration_s), self.seed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +134,7 @@ class Babble(WireFault):
     def begin(self, stage: Stage) -> None:
         """Let it babble, eight bytes at a time."""
         frame = Frame(self.can_id, 8, 0)
-        self.wire(stage).babble(frame, round(self.gap_us * 1e3), round(self.duration_s * 1e9))
+        self.wire(stage).babble(frame, round(self.gap_us * 1e3), whole_ns(self.duration_s))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,11 @@ from dbc.contract import Contract
 from hil.bus.wire import Port, Wire
 
 LONGEST_S = 3600.0
-_NS_PER_S = 1_000_000_000
+
+
+def whole_ns(seconds: float) -> int:
+    """Return a time in whole ns."""
+    return round(seconds * 1e9)
 
 
 class FaultError(ValueError):
@@ -113,6 +117,10 @@ class Fault:
             If it cannot be had there.
         """
 
+    def begin_ns(self, origin_ns: int) -> int:
+        """Return when it begins, ns, its time counting from `origin_ns`."""
+        return origin_ns + whole_ns(self.at_s)
+
     @property
     def table(self) -> dict[str, Any]:
         """Kind, time and parameters as in a scenario file, without what is at its default."""
@@ -137,10 +145,6 @@ class WireFault(Fault):
         """Have it begin `at_s` after bus time `origin_ns`."""
         self.check(stage)
         stage.at(self.begin_ns(origin_ns), partial(self.begin, stage))
-
-    def begin_ns(self, origin_ns: int) -> int:
-        """Return the bus time at which it begins, ns."""
-        return origin_ns + round(self.at_s * _NS_PER_S)
 
     @property
     def concerned(self) -> str:
@@ -186,7 +190,7 @@ class LastingWireFault(WireFault):
         """Have it begin `at_s` after bus time `origin_ns`, and end."""
         WireFault.inject(self, stage, origin_ns)
         if self.duration_s < math.inf:
-            end_ns = self.begin_ns(origin_ns) + round(self.duration_s * _NS_PER_S)
+            end_ns = self.begin_ns(origin_ns) + whole_ns(self.duration_s)
             stage.at(end_ns, partial(self.end, stage))
 
     @abstractmethod

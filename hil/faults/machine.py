@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import PERIOD_NS, next_period
-from hil.faults.fault import Fault, FaultError, Stage, number
+from hil.faults.fault import Fault, FaultError, Stage, number, whole_ns
 
 MAX_LOAD_N = 1e6
 _MICRO = 1e6
@@ -30,10 +30,10 @@ class BenchChannelFault(Fault):
     def inject(self, stage: Stage, origin_ns: int) -> None:
         """Have it begin with the first period `at_s` after time `origin_ns`, and end."""
         begin, end = self.words
-        begin_ns = origin_ns + round(self.at_s * 1e9)
+        begin_ns = self.begin_ns(origin_ns)
         stage.supervisor.plan(next_period(begin_ns) // PERIOD_NS, **begin)
         if self.duration_s < math.inf:
-            end_ns = begin_ns + round(self.duration_s * 1e9)
+            end_ns = begin_ns + whole_ns(self.duration_s)
             stage.supervisor.plan(next_period(end_ns) // PERIOD_NS, **end)
 
     @property

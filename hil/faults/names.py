@@ -8,8 +8,10 @@ from typing import get_type_hints
 from dbc import messages as layouts
 from dbc.codec import signal_name
 
-NODES = ("controller", "plant", "supervisor")
 SIDES = ("controller", "plant")
+"""The nodes that may be processes of their own."""
+
+NODES = (*SIDES, "supervisor")
 
 SENDERS = {  # of the messages on the bus
     layouts.DriveCommand: "controller",

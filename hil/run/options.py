@@ -11,6 +11,7 @@ from firmware_py.chosen_firmware import ChosenFirmware
 from firmware_py.chosen_tuning import ChosenTuning, chosen_tuning
 from firmware_py.node import EXECUTION_NS
 from hil.bus.wire import DEFAULT_DATA_BIT_RATE
+from hil.faults import names
 from hil.run.stopping import StopFlag
 from hil.scenario import Scenario, controller_of
 from plant_sim.machine import Machine
@@ -19,7 +20,7 @@ DEFAULT_BIT_RATE = 1_000_000
 INTERRUPTED = "interrupted"
 """`Recording.ending` of a run that was asked to stop."""
 
-SIDES = frozenset({"plant", "controller"})
+SIDES = frozenset(names.SIDES)
 """The nodes that may be processes of their own."""
 
 HUB_GREETING = "hilbus channel"

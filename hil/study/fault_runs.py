@@ -14,8 +14,10 @@ from dbc.frame import ERR_FLAG
 from firmware_py.chosen_tuning import ChosenTuning
 from firmware_py.diagnosis import Fault as ControllerFault
 from firmware_py.diagnosis import State
+from firmware_py.node import PHASE_NS
 from hil.bench import Bench
 from hil.faults.catalogue import GROUPS
+from hil.faults.names import NODES
 from hil.measure import M_TO_MM
 from hil.run.inprocess import InprocessRig
 from hil.run.options import RigOptions
@@ -29,7 +31,7 @@ AFTER_S = 0.8
 """From the fault to the end."""
 
 _WATCHED_S = 0.01
-_CONTROLLER_PHASE_MS = 0.5
+_CONTROLLER_PHASE_MS = PHASE_NS * 1e-6
 _CASES_PER_TASK = 40
 _MS = 1e3 * PERIOD_S
 _END_STATES = {
@@ -171,7 +173,7 @@ def play_case(rig: InprocessRig, case: Case, baseline: Bench) -> Played:
 def _play_some(tuning: ChosenTuning, cases: Sequence[Case]) -> list[Played]:
     with InprocessRig(RigOptions(record_directory=Path(), tuning=tuning)) as rig:
         baselines: dict[str, Bench] = {}
-        for name in {case.phase for case in cases}:
+        for name in dict.fromkeys(case.phase for case in cases):
             baselines[name] = _begin(rig, PHASES[name])
             baselines[name].run(AFTER_S)
         return [play_case(rig, case, baselines[case.phase]) for case in cases]
@@ -190,8 +192,7 @@ def _watch(bench: Bench) -> float | None:
     """Run the first periods after the fault one by one; return when a node was seen bus-off, ms."""
     seen_ms = None
     for period in range(round(_WATCHED_S / PERIOD_S)):
-        nodes = ("controller", "plant", "supervisor")
-        if seen_ms is None and any(bench.error_state(node).name == "bus-off" for node in nodes):
+        if seen_ms is None and any(bench.error_state(node).name == "bus-off" for node in NODES):
             seen_ms = period * _MS
         bench.run(PERIOD_S)
     return seen_ms
