@@ -6,8 +6,9 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
 
-from dbc.e2e import Checker, Protector, receiver_configuration
+from dbc.e2e import Checker, Protector, profile2_crc, receiver_configuration
 from dbc.frame import Frame
+from dbc.profile2 import MAX_COUNTER
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -87,6 +88,11 @@ class MessageCodec(Generic[P, T]):
     def checker(self) -> Checker:
         """Return a receiver's E2E state for this (protected) message."""
         return Checker(self._protected_ids(), self.dlc)
+
+    def with_crc(self, data: int) -> int:
+        """Return a payload of this (protected) message with the CRC that belongs to it and its counter."""
+        data_id = self._protected_ids()[data >> 8 & MAX_COUNTER]
+        return data & ~0xFF | int(profile2_crc(data, self.dlc, data_id))
 
     def receiver_configuration(self) -> np.ndarray:
         """Return what `dbc.e2e.profile2_check` needs to know of this (protected) message."""

@@ -5,7 +5,7 @@ from numba.extending import register_jitable
 
 from dbc.jit import entry_point, njit
 from dbc.node import next_period
-from dbc.packet import FRAME_WORDS, FRAMES, HEAD_DLC, ID_MASK, KIND, NOT_ANSWERED, TIME, TIMER
+from dbc.packet import FRAME_WORDS, FRAMES, HEAD_DLC, ID_MASK, KIND, NOT_ANSWERED, TIME, TIMER, put_frame
 from firmware_py.entry_points import FRAMES_SENT, SOURCES, data_of, record_period, run_period, take_frame
 from firmware_py.task_layout import FRAME_ID, FRAME_LENGTH, FRAME_SIZE
 
@@ -49,15 +49,14 @@ def _answer_timer(memory, execution_ns, rows, count, packet, answer):  # type: i
     answered = np.frombuffer(answer, np.int64)
     answered[0] = _next_period(now_ns + 1)
     frames = memory[FRAMES_SENT]
+    length = 8
     for number in range(sends):
         frame = number * FRAME_SIZE
-        word = 1 + number * FRAME_WORDS
-        answered[word] = now_ns + execution_ns
-        answered[word + 1] = np.int64(np.uint32(frames[frame + FRAME_ID])) | (
-            np.int64(frames[frame + FRAME_LENGTH]) << HEAD_DLC
-        )
-        answered[word + 2] = np.int64(data_of(frames, frame))
-    return 8 * (1 + sends * FRAME_WORDS)
+        head = np.int64(np.uint32(frames[frame + FRAME_ID]))
+        head |= np.int64(frames[frame + FRAME_LENGTH]) << HEAD_DLC
+        data = np.int64(data_of(frames, frame))
+        length = put_frame(answered, number, now_ns + execution_ns, head, data)
+    return length
 
 
 answer_timer = entry_point(_answer_timer)

@@ -5,7 +5,7 @@ import numpy as np
 from dbc import e2e
 from dbc.jit import njit
 from dbc.node import PERIOD_NS
-from dbc.packet import KIND, NOT_ANSWERED, TIME, TIMER
+from dbc.packet import KIND, NOT_ANSWERED, TIME, TIMER, put_frame
 from dbc.profile2 import CONFIGURATION_SIZE
 
 _POSITION_START = CONFIGURATION_SIZE
@@ -58,7 +58,5 @@ def answer_setpoint(  # type: ignore[no-untyped-def]
     payload = np.uint64((setpoints[index] & _POSITION_MASK) << layout[_POSITION_START])
     answered = np.frombuffer(answer, np.int64)
     answered[0] = due_ns + PERIOD_NS
-    answered[1] = due_ns
-    answered[2] = head
-    answered[3] = np.int64(e2e.profile2_protect(counter, layout[:CONFIGURATION_SIZE], payload))
-    return 32
+    protected = e2e.profile2_protect(counter, layout[:CONFIGURATION_SIZE], payload)
+    return put_frame(answered, 0, due_ns, head, np.int64(protected))

@@ -4,7 +4,7 @@ import numpy as np
 
 from dbc.jit import njit
 from dbc.node import PERIOD_NS
-from dbc.packet import FRAME_WORDS, FRAMES, HEAD_DLC, ID_MASK, KIND, NOT_ANSWERED, TIME, TIMER
+from dbc.packet import FRAME_WORDS, FRAMES, HEAD_DLC, ID_MASK, KIND, NOT_ANSWERED, TIME, TIMER, put_frame
 from dbc.profile2 import DLC
 from plant_sim import period
 from plant_sim.period import run_period
@@ -81,7 +81,4 @@ def answer_timer(  # type: ignore[no-untyped-def]
     count[0] += 1
     answered = np.frombuffer(answer, np.int64)
     answered[0] = np.int64(row[period.TIME]) + PERIOD_NS
-    answered[1] = now_ns
-    answered[2] = feedback_head
-    answered[3] = np.int64(payload)
-    return 32
+    return put_frame(answered, 0, now_ns, feedback_head, np.int64(payload))

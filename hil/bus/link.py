@@ -20,6 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 from can.util import CAN_FD_DLC
 
 from dbc.frame import EFF_FLAG, FD_FLAG, Frame
+from dbc.packet import TIMED_FRAME
 
 PROTOCOL_VERSION = 3
 MAX_PACKET = 65536
@@ -28,9 +29,8 @@ STOP, SAVE, FORGET = range(3, 6)
 
 _FRAME = struct.Struct("<IB3xQ")
 _FD_FRAME = struct.Struct("<IBB2x64s")
-_TIMED_FRAME = struct.Struct("<qIB3xQ")
 _TIME = struct.Struct("<q")
-TIMED_FRAME_BYTES = _TIMED_FRAME.size
+TIMED_FRAME_BYTES = TIMED_FRAME.size
 
 
 class LinkError(Exception):
@@ -80,7 +80,7 @@ def pack_timed(time_ns: int, frame: Frame) -> bytes:
 def unpack_timed(packet: bytes) -> tuple[int, Frame]:
     """Return bus time in ns and frame."""
     if len(packet) == TIMED_FRAME_BYTES:
-        time_ns, can_id, dlc, data = _TIMED_FRAME.unpack(packet)
+        time_ns, can_id, dlc, data = TIMED_FRAME.unpack(packet)
         return time_ns, Frame(can_id, dlc, data)
     (time_ns,) = _TIME.unpack_from(packet)
     return time_ns, _read_fd_frame(packet[_TIME.size :])

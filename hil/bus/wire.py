@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -188,11 +189,11 @@ class Wire:
         says, the row being one of `payloads`.
         """
         head = self.log[:, at.LOG_HEAD]
-        can_id = head & 0xFFFF_FFFF | head >> at.FLAGS_SHIFT << 32
+        can_id, dlc = _id_and_dlc(head)
         data = self.log[:, at.LOG_DATA].copy()
         fd = np.flatnonzero(can_id & FD_FLAG)
         data[fd] = data[fd] & ((1 << PAYLOAD_SHIFT) - 1) | np.arange(len(fd)) << PAYLOAD_SHIFT
-        return np.column_stack([self.log[:, at.LOG_TIME], can_id, head >> 32 & 0xFF, data]).view(np.uint64)
+        return np.column_stack([self.log[:, at.LOG_TIME], can_id, dlc, data]).view(np.uint64)
 
     @property
     def payloads(self) -> np.ndarray:
@@ -205,10 +206,10 @@ class Wire:
     def logged(self, row: int) -> tuple[int, Frame]:
         """Return end (bus time, ns) and frame in a row of the log."""
         time_ns, head, data, _ = self.log[row].tolist()
-        can_id = head & 0xFFFF_FFFF | head >> at.FLAGS_SHIFT << 32
+        can_id, dlc = _id_and_dlc(head)
         if can_id & FD_FLAG:
             data = int.from_bytes(self._payloads[data >> PAYLOAD_SHIFT].tobytes(), "little")
-        return time_ns, Frame(can_id, head >> 32 & 0xFF, data % (1 << 64) if data < 0 else data)
+        return time_ns, Frame(can_id, dlc, data % (1 << 64) if data < 0 else data)
 
     def attach(self, node: "Node | link.Askable", clock: Clock | None = None) -> Port:
         """Add a node; it hears the frames that end from now on.
@@ -520,6 +521,11 @@ class Wire:
         """Take away what a node sends over the bus; the bench channel is none."""
         heard = tuple(send for send in actions.sends if send[1].can_id in self._out_of_band)
         return actions._replace(sends=heard)
+
+
+def _id_and_dlc(head: Any) -> tuple[Any, Any]:
+    """Return identifier with its flags, and length, of a head (`hil.bus.wire_core`) or an array of them."""
+    return head & 0xFFFF_FFFF | head >> at.FLAGS_SHIFT << 32, head >> 32 & 0xFF
 
 
 def _signed(word: int) -> int:

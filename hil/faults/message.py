@@ -11,9 +11,9 @@ from random import Random
 from typing import Any, ClassVar
 
 from dbc.codec import MessageCodec
-from dbc.e2e import MAX_COUNTER, profile2_crc
 from dbc.frame import Frame
 from dbc.node import Actions
+from dbc.profile2 import MAX_COUNTER
 from hil.faults.fault import FaultError, Stage, WireFault, choice, name, number
 from hil.faults.names import PROTECTED, messages, sender, signals
 
@@ -234,6 +234,4 @@ def _with_counter(codec: MessageCodec[..., Any], data: int, counter: int) -> int
 
 def _protected(codec: MessageCodec[..., Any], data: int) -> int:
     """Return a payload with the CRC that belongs to it and its counter; as it is if it carries none."""
-    if codec.data_ids is None:
-        return data
-    return data & ~0xFF | int(profile2_crc(data, codec.dlc, codec.data_ids[_counter(data)]))
+    return data if codec.data_ids is None else codec.with_crc(data)

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from dbc import e2e
 from dbc.codec import MessageCodec
 from dbc.contract import Contract
 from dbc.frame import ERR_FLAG, Frame
 from dbc.messages import BenchCommand
 from dbc.node import PERIOD_NS
+from dbc.profile2 import MAX_COUNTER
 from firmware_py.calibration import Calibration
 from firmware_py.node import EXECUTION_NS, PHASE_NS, Controller
 from hil.bus.wire import Clock
@@ -281,16 +281,13 @@ def _unsure(timers_ns: np.ndarray, inputs: np.ndarray, bit_rate: int, phase: Tim
 def _under_law(inputs: np.ndarray, contract: Contract, law: int) -> np.ndarray:
     """Return the frames with another control law in every ControllerCommand whose CRC is right."""
     command = contract.controller_command
-    assert command.data_ids is not None
     changed = inputs.copy()
     for row in np.flatnonzero((inputs[:, 1] == command.can_id) & (inputs[:, 2] == command.dlc)).tolist():
         data = int(inputs[row, 3])
-        counter = data >> 8 & e2e.MAX_COUNTER
-        data_id = command.data_ids[counter]
-        if e2e.profile2_crc(data, command.dlc, data_id) == data & 0xFF:
+        if command.with_crc(data) == data:
             asked = command.unpack(data)
-            payload = command.pack(asked.enable, law, asked.fault_reset) | counter << 8
-            changed[row, 3] = payload | e2e.profile2_crc(payload, command.dlc, data_id)
+            payload = command.pack(asked.enable, law, asked.fault_reset)
+            changed[row, 3] = command.with_crc(payload | data & MAX_COUNTER << 8)
     return changed
 
 
