@@ -9,10 +9,11 @@ from pathlib import Path
 
 from dbc.contract import Contract
 from dbc.node import PERIOD_NS
+from firmware_py.emulated.processors import TARGETS
 from firmware_py.node import EXECUTION_NS, Controller
 
 PYTHON = "python"
-PROCESSORS = "cortex-m0plus", "cortex-m3", "cortex-m4"
+PROCESSORS = tuple(TARGETS)
 FIRMWARES = (PYTHON, *PROCESSORS)
 FIGURES = "clock_mhz", "execution_us"
 COST = Path(__file__).parent / "emulated" / "cost.json"
@@ -51,8 +52,10 @@ class ChosenFirmware:
             raise FirmwareError(f"there is no firmware {self.name!r}: choose one of {', '.join(FIRMWARES)}")
         if self.clock_mhz is not None and self.name == PYTHON:
             raise FirmwareError(f"a clock needs a processor: {' or '.join(PROCESSORS)}")
-        if self.clock_mhz is not None and not 1.0 <= self.clock_mhz <= 1000.0:
-            raise FirmwareError(f"a clock of {self.clock_mhz:g} MHz is not from 1 to 1000")
+        if self.clock_mhz is not None:
+            check_clock(self.clock_mhz)
+        if self.execution_us is not None and not math.isfinite(self.execution_us):
+            raise FirmwareError(f"an execution time of {self.execution_us:g} µs is no time")
         if not 0 <= self.execution_ns < PERIOD_NS // 2:
             raise FirmwareError(
                 f"an execution time of {self.execution_ns / 1e3:g} µs is not below half a control period, "
@@ -85,13 +88,36 @@ class ChosenFirmware:
         """
         if self.name == PYTHON:
             return Controller(contract, calibration_block, self.execution_ns)
-        if importlib.util.find_spec("unicorn") is None or importlib.util.find_spec("elftools") is None:
-            raise FirmwareError(f"--firmware {self.name} needs the emulator: pip install 'ddh-hil[pil]'")
+        require_emulator(f"--firmware {self.name}")
         from firmware_py.emulated.image import reference_image
         from firmware_py.emulated.node import EmulatedController
 
         image = reference_image(self.name)
         return EmulatedController(contract, calibration_block, self.name, image, self.execution_ns)
+
+
+def check_clock(clock_mhz: float) -> None:
+    """Refuse a clock that no processor has.
+
+    Raises
+    ------
+    FirmwareError
+        If it is not from 1 to 1000 MHz.
+    """
+    if not 1.0 <= clock_mhz <= 1000.0:
+        raise FirmwareError(f"a clock of {clock_mhz:g} MHz is not from 1 to 1000")
+
+
+def require_emulator(what: str) -> None:
+    """Make sure that the emulator can be had for `what` is asked.
+
+    Raises
+    ------
+    FirmwareError
+        If it is not installed.
+    """
+    if importlib.util.find_spec("unicorn") is None or importlib.util.find_spec("elftools") is None:
+        raise FirmwareError(f"{what} needs the emulator: pip install 'ddh-hil[pil]'")
 
 
 def firmware_of_text(text: str) -> ChosenFirmware:

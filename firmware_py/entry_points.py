@@ -92,7 +92,12 @@ def data_of(frames, frame):  # type: ignore[no-untyped-def]
 @register_jitable
 def record_period(memory, row, now_ns):  # type: ignore[no-untyped-def]
     """Fill a row of the record."""
-    words, state, io = memory[_TASK], memory[_STATE], memory[_IO]
+    fill_row(row, now_ns, memory[_TASK], memory[_STATE], memory[_IO])
+
+
+@register_jitable
+def fill_row(row, now_ns, words, state, io):  # type: ignore[no-untyped-def]
+    """Fill a row of the record from the arrays `task`, `state` and `io`."""
     row[0] = now_ns
     row[1] = words[at.STATE]
     row[2] = words[at.FAULTS]

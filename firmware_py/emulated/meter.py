@@ -9,15 +9,15 @@ from dbc.node import PERIOD_NS
 from firmware_py.calibration import Calibration
 from firmware_py.emulated.cycles import Cost
 from firmware_py.emulated.image import Image
+from firmware_py.emulated.machine import SCRATCH, Machine
 from firmware_py.emulated.node import EmulatedController
 from firmware_py.kernel import layout as k
-from firmware_py.kernel.layout import IO_LAW, IO_POSITION, IO_SETPOINT
 from firmware_py.state_machine import RUN
 
 _ENABLED = 0x1237
 _LONGEST_BRING_UP = 20
 _COMMAND_CYCLE_NS = 100 * PERIOD_NS
-_CALIBRATION, _STATE, _IO = (0x60000000 + offset for offset in (0, 0x1000, 0x2000))
+_CALIBRATION, _STATE, _IO = (SCRATCH[0] + offset for offset in (0, 0x1000, 0x2000))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,17 +142,17 @@ class StepMeter:
         Where it begins.
     """
 
-    def __init__(self, machine: Any, calibration: Calibration, position_um: int) -> None:
+    def __init__(self, machine: Machine, calibration: Calibration, position_um: int) -> None:
         self._machine = machine
         machine.write_words(_CALIBRATION, calibration.words)
         machine.write_words(_STATE, [0] * k.ST_SIZE)
         machine.write_words(_IO, [0] * k.IO_SIZE)
-        machine.write_words(_IO + 4 * IO_LAW, [calibration.law])
-        machine.write_words(_IO + 4 * IO_POSITION, [position_um])
+        machine.write_words(_IO + 4 * k.IO_LAW, [calibration.law])
+        machine.write_words(_IO + 4 * k.IO_POSITION, [position_um])
         machine.call("ddh_control_reset", _CALIBRATION, _STATE, _IO)
 
     def step(self, setpoint_0p1um: int, position_um: int) -> Cost:
         """Run a control step."""
-        self._machine.write_words(_IO + 4 * IO_SETPOINT, [setpoint_0p1um, position_um])
+        self._machine.write_words(_IO + 4 * k.IO_SETPOINT, [setpoint_0p1um, position_um])
         self._machine.call("ddh_control_step", _CALIBRATION, _STATE, _IO)
         return self._machine.cost

@@ -11,6 +11,7 @@ from dbc.packet import answer_by_entry_points
 from firmware_py import entry_points
 from firmware_py import task_layout as at
 from firmware_py.calibration import Calibration, CalibrationError
+from firmware_py.chosen_firmware import FirmwareError
 from firmware_py.contract_words import contract_words
 from firmware_py.emulated.image import Image
 from firmware_py.emulated.machine import Machine
@@ -19,7 +20,6 @@ from firmware_py.node import Controller, execution_time
 
 CAN = 0x40006400
 _TO_SEND = CAN + 16
-_MESSAGE_WORDS = 4
 _STATE = at.MAILBOXES_SIZE + at.TASK_SIZE
 _IO = _STATE + k.ST_SIZE
 _CONTROLLER_WORDS = _IO + k.IO_SIZE
@@ -49,7 +49,7 @@ class EmulatedController(Controller):
 
     Raises
     ------
-    ValueError
+    FirmwareError
         If the contract differs from the one that the C was exported from.
     """
 
@@ -58,7 +58,10 @@ class EmulatedController(Controller):
     ) -> None:
         super().__init__(contract, calibration_block, execution_ns)
         if not np.array_equal(contract_words(contract), contract_words(Contract.load())):
-            raise ValueError(f"the image for {processor} was built from the packaged DBC, not from this one")
+            raise FirmwareError(
+                f"the image for {processor} was built from the packaged DBC, not from this one: "
+                "use --firmware python with it"
+            )
         self.machine = Machine(processor, image)
         self._address = image.symbols["controller"]
 
@@ -84,7 +87,9 @@ class EmulatedController(Controller):
         """Timer interrupt."""
         self.machine.call("timer_handler")
         words = self.machine.read_words(self._address, _CONTROLLER_WORDS)
-        self.record.append(_record_row(now_ns, words))
+        task, state, io = words[at.MAILBOXES_SIZE : _STATE], words[_STATE:_IO], words[_IO:]
+        entry_points.fill_row(self._row, now_ns, task, state, io)
+        self.record.append(self._row)
         return Actions(next_period(now_ns + 1), self._sent_frames(now_ns + self._execution_ns))
 
     def answer(self, packet: memoryview, answer: bytearray) -> int:
@@ -92,23 +97,9 @@ class EmulatedController(Controller):
         return answer_by_entry_points(self, packet, answer)
 
     def _sent_frames(self, send_ns: int) -> tuple[tuple[int, Frame], ...]:
-        sent = [word & 0xFFFF_FFFF for word in self.machine.read_words(_TO_SEND, 1 + 3 * _MESSAGE_WORDS)]
-        messages = (sent[1 + 4 * n : 5 + 4 * n] for n in range(sent[0]))
+        words = self.machine.read_words(_TO_SEND, 1 + at.MAX_FRAMES * at.FRAME_SIZE)
+        count, *sent = (word & 0xFFFF_FFFF for word in words)
+        messages = (sent[n * at.FRAME_SIZE : (n + 1) * at.FRAME_SIZE] for n in range(count))
         return tuple(
             (send_ns, Frame(can_id, length, low | high << 32)) for can_id, length, low, high in messages
         )
-
-
-def _record_row(now_ns: int, words: tuple[int, ...]) -> tuple[int, ...]:
-    """Return a row of the record from the controller's words."""
-    task, state, io = words[at.MAILBOXES_SIZE : _STATE], words[_STATE:_IO], words[_IO:]
-    return (
-        now_ns,
-        task[at.STATE],
-        task[at.FAULTS],
-        io[k.IO_SETPOINT],
-        io[k.IO_POSITION],
-        task[at.VELOCITY],
-        io[k.IO_FLAGS],
-        *state[k.ST_V1 : k.ST_Z4 + 1],
-    )

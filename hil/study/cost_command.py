@@ -9,11 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 from dbc.node import PERIOD_NS
-from firmware_py.chosen_firmware import COST
+from firmware_py.chosen_firmware import COST, check_clock, require_emulator
 from hil.run.options import BenchError
 
 DESCRIPTION = """Instructions are counted in an emulator and exact. Cycles are an estimate from the reference
 manuals of Arm, a range, with zero wait states; worst is the worst seen, not a bound."""
+
+MOST_PERIODS = 10_000
+"""Control periods of the sine."""
 
 _WIDTH = 140
 
@@ -29,7 +32,7 @@ def add_command(commands: Any) -> None:
         "--write", action="store_true", help="measure, and keep it as the figures to compare with"
     )
     parser.add_argument(
-        "--periods", type=int, default=10_000, metavar="N", help="of the sine (default 10000)"
+        "--periods", type=int, default=MOST_PERIODS, metavar="N", help="of the sine (default 10000, all)"
     )
     parser.add_argument("--clock-mhz", type=float, metavar="F", help="for the share of the period")
     parser.add_argument("--json", action="store_true", help="print all figures")
@@ -37,7 +40,12 @@ def add_command(commands: Any) -> None:
 
 def cost(arguments: argparse.Namespace) -> int:
     """Show the bill."""
+    if not 1 <= arguments.periods <= MOST_PERIODS:
+        raise BenchError(f"--periods is {arguments.periods}, must be from 1 to {MOST_PERIODS}")
+    if arguments.clock_mhz is not None:
+        check_clock(arguments.clock_mhz)
     if arguments.measure or arguments.write:
+        require_emulator("hil cost --measure")
         from firmware_py.emulated.build import BuildError
         from hil.study.cost import bill, compilers_bill
 

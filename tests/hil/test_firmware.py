@@ -11,7 +11,8 @@ from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
 from firmware_py.chosen_firmware import PROCESSORS, ChosenFirmware, FirmwareError, firmware_of_text
 from firmware_py.chosen_tuning import chosen_tuning
-from firmware_py.emulated.processors import TARGETS
+from firmware_py.emulated.cycles import TABLES
+from firmware_py.emulated.machine import MODELS
 from firmware_py.node import EXECUTION_NS
 from firmware_py.state_machine import POWER_ON
 from hil.run.inprocess import run_inprocess
@@ -80,7 +81,7 @@ def test_what_an_image_was_not_built_for_is_refused(tmp_path):
     moved = re.sub(rf"\b(BO_|SG_|VAL_) {CONTRACT.drive_command.can_id} ", r"\1 300 ", text)
     other.write_text(moved, encoding="cp1252")
     contract = Contract.load(other)
-    with pytest.raises(ValueError, match="built from the packaged DBC"):
+    with pytest.raises(FirmwareError, match="built from the packaged DBC"):
         ChosenFirmware("cortex-m4").controller(contract, chosen_tuning().calibration.to_bytes())
 
 
@@ -91,6 +92,8 @@ def test_what_an_image_was_not_built_for_is_refused(tmp_path):
         ({"clock_mhz": 48.0}, "a clock needs a processor"),
         ({"name": "cortex-m4", "clock_mhz": 0.0}, "a clock of 0 MHz is not from 1 to 1000"),
         ({"execution_us": -1.0}, "an execution time of -1 µs"),
+        ({"execution_us": float("nan")}, "an execution time of nan µs"),
+        ({"execution_us": float("inf")}, "an execution time of inf µs"),
         ({"execution_us": 500.0}, "is not below half a control period, 500 µs"),
         ({"name": "cortex-m0plus", "clock_mhz": 4.0}, "is not below half a control period"),
     ],
@@ -120,7 +123,7 @@ def test_a_firmware_is_what_its_text_says(text):
 
 
 def test_processors_are_those_that_are_emulated():
-    assert tuple(TARGETS) == PROCESSORS
+    assert PROCESSORS == tuple(MODELS) == tuple(TABLES)
 
 
 def test_a_reset_from_the_bench_restarts_the_program():

@@ -10,7 +10,9 @@ from firmware_py.emulated.image import MANIFEST, reference_image
 from firmware_py.emulated.meter import Meter
 from firmware_py.emulated.processors import TARGETS
 from hil import cli
-from hil.study.cost import CONTROLLERS, calibration_of, jump_inputs, step_costs, summary
+from hil.scenario import load_scenario
+from hil.study.cost import CONTROLLERS, SCENARIO, calibration_of, jump_inputs, step_costs, summary
+from hil.study.cost_command import MOST_PERIODS
 
 FIGURES = json.loads(COST.read_text())["processors"]
 
@@ -56,3 +58,21 @@ def test_hil_cost_shows_the_bill(capsys):
     assert json.loads(capsys.readouterr().out)["processors"] == FIGURES
     assert cli.main(["cost", "--clock-mhz", "100"]) == 0
     assert "100 MHz" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--measure", "--periods", "0"), "--periods is 0, must be from 1 to 10000"),
+        (("--measure", "--periods", "10001"), "--periods is 10001"),
+        (("--clock-mhz", "0"), "a clock of 0 MHz is not from 1 to 1000"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(capsys, arguments, said):
+    assert cli.main(["cost", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_all_of_the_sine_is_the_most_that_is_measured():
+    assert load_scenario(SCENARIO).periods == MOST_PERIODS
