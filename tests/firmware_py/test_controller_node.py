@@ -629,6 +629,13 @@ def test_the_status_shows_the_assumed_execution_time(running):
     assert controller_status(running)["ExecutionTime"] == EXECUTION_NS / PERIOD_NS * 100.0
 
 
+def test_until_it_is_measured_a_tenth_of_the_period_is_assumed_to_be_executed():
+    words = [0] * at.TASK_SIZE
+    contract, mailboxes = contract_words(CONTRACT).tolist(), [0] * at.MAILBOXES_SIZE
+    task.power_on(contract, mailboxes, words, [0] * k.ST_SIZE, [0] * k.IO_SIZE, LAW_ADRC)
+    assert words[at.EXECUTION_TIME] * 0.5 == 10.0
+
+
 def test_the_status_shows_the_state(running):
     assert controller_status(running)["State"] == "Run"
     assert controller_status(running, feedback="lost")["State"] == "Safe"
