@@ -293,8 +293,9 @@ def test_a_faulty_drive_gets_no_voltage_until_a_reset_is_asked_for(standby):
 
 
 @pytest.mark.parametrize("statusword", [0x0219, 0x021A, 0x021C, 0x0258])
-def test_what_is_not_exactly_the_fault_state_is_not_reset(standby, statusword):
-    assert set_inputs(standby, statusword=statusword, fault_reset=1).period().controlword != RESET
+def test_a_statusword_of_no_state_gets_no_voltage_and_no_reset(standby, statusword):
+    set_inputs(standby, statusword=statusword, enable=1, fault_reset=1)
+    assert standby.period().controlword == DISABLE_VOLTAGE
 
 
 def test_a_drive_that_still_reacts_to_its_fault_is_not_reset_yet(standby):
