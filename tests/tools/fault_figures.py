@@ -7,6 +7,7 @@ from readme_figures import ROOT, write_to_readme
 
 from hil import cli
 from hil.study.fault_pages import markdown
+from hil.study.faults_command import EXIT_OK, EXIT_UNEXPECTED
 
 PAGE = ROOT / "docs" / "fault_matrix.md"
 
@@ -15,6 +16,8 @@ def main() -> int:
     """Return the exit code of ``hil faults``."""
     out = ROOT / "out" / "faults"
     code = cli.main(["faults", "--out", str(out)])
+    if code not in (EXIT_OK, EXIT_UNEXPECTED):
+        return code
     matrix = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
     write_to_readme("matrix", markdown(matrix), PAGE)
     return code

@@ -1,6 +1,7 @@
 """Replay: the firmware computes again what it sent, from a log in any format; every departure is found."""
 
 import json
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -340,6 +341,21 @@ def test_exit_code_1_comes_with_the_first_difference_in_signals(log, tmp_path, c
     said = capsys.readouterr().out
     assert f"first difference of DriveCommand: {time[1:-1]} s" in said
     assert f"TargetVelocity    {(velocity + 4) / 4:g} rpm" in said
+
+
+def test_the_guide_shows_what_is_printed(tmp_path, capsys, monkeypatch):
+    guide = (Path(__file__).parents[3] / "docs" / "testing.md").read_text(encoding="utf-8")
+    shown = re.search(r"```text\n(first difference .*?)```", guide, re.DOTALL)
+    played, replayed = (
+        next(line.strip().split()[1:] for line in guide.splitlines() if line.strip().startswith(command))
+        for command in ("hil run sine_load --log .blf --out before", "hil replay before/bus.blf --tuning")
+    )
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*played, "--mode", "inprocess", "--duration", "0.1"]) == 0
+    assert cli.main(replayed) == 1
+    printed = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert shown is not None
+    assert set(shown[1].splitlines()) <= set(printed)
 
 
 def test_another_tuning_is_an_exit_code_and_a_picture(log, tmp_path):
