@@ -4,7 +4,6 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import can
 from dbc.contract import Contract
 from dbc.frame import Frame
 from hil.bus import link
+from hil.bus.agenda import Agenda
 from hil.bus.hub import Hub
 from hil.bus.messages import to_message
 from hil.bus.opening import bus_settings, open_bus
@@ -54,10 +54,8 @@ def take_faults(hub: Hub) -> None:
         If the packaged DBC cannot be read.
     """
     contract = Contract.load()
-
-    def at(bus_ns: int, action: Action) -> None:
-        hub.agenda.at(bus_ns, partial(_do, action) if bus_ns > hub.wire.now_ns else action)
-
+    hub.agenda = Agenda(hub.wire, _tell)
+    at = hub.agenda.at
     stage = Stage(contract, BenchSender(contract, at, hub.send), hub.wire, {}, at)
 
     def take(table: dict[str, Any]) -> None:
@@ -66,12 +64,8 @@ def take_faults(hub: Hub) -> None:
     hub.take_fault = take
 
 
-def _do(action: Action) -> None:
-    """Do what was put off; by now there may be no room for it."""
-    try:
-        action()
-    except ValueError as error:
-        print(f"hil: {error}", file=sys.stderr)
+def _tell(error: ValueError) -> None:
+    print(f"hil: {error}", file=sys.stderr)
 
 
 def _inject(arguments: argparse.Namespace) -> int:

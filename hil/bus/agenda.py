@@ -14,10 +14,13 @@ class Agenda:
     ----------
     wire : Wire
         The bus whose time counts.
+    failed : callable
+        Told the ValueError of what was put off and by now cannot be done; by default it is raised.
     """
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Wire, failed: Callable[[ValueError], None] | None = None) -> None:
         self._wire = wire
+        self._failed = failed or _raise
         self._entries: list[tuple[int, int, Callable[[], None]]] = []
         self._ever = count()
 
@@ -38,5 +41,12 @@ class Agenda:
         while self._entries and self._entries[0][0] < until_ns:
             bus_ns, _, action = heappop(self._entries)
             self._wire.run(bus_ns)
-            action()
+            try:
+                action()
+            except ValueError as error:
+                self._failed(error)
         self._wire.run(until_ns)
+
+
+def _raise(error: ValueError) -> None:
+    raise error

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from functools import partial
 
 import numpy as np
 
@@ -117,8 +116,8 @@ class VirtualSession:
         self.ports: dict[str, Port] = {}
         for node in (supervisor, *nodes):
             self.ports[node.name] = wire.attach(node, CLOCKS[node.name])
-        self.stage = Stage(contract, supervisor, wire, self.ports, self.at)
-        self._agenda = Agenda(wire)
+        self._agenda = Agenda(wire, self._give_up)
+        self.stage = Stage(contract, supervisor, wire, self.ports, self._agenda.at)
         self._startup_s = time.perf_counter() - begin_s
         self._wall_s = 0.0
         self._advance(self._power_on)
@@ -126,10 +125,6 @@ class VirtualSession:
     def inject(self, fault: Fault, origin_ns: int) -> None:
         """Have something go wrong; see `hil.run.rig.Session`."""
         fault.inject(self.stage, origin_ns)
-
-    def at(self, bus_ns: int, action: Callable[[], None]) -> None:
-        """Have something done at a bus time; see `hil.bus.agenda.Agenda`."""
-        self._agenda.at(bus_ns, action if bus_ns <= self.wire.now_ns else partial(self._do, action))
 
     def run_to(self, period: int) -> None:
         """Go on to the start of a period, counted from power-on."""
@@ -169,11 +164,9 @@ class VirtualSession:
             if self._options.stopped.is_set():
                 self.ending = INTERRUPTED
 
-    def _do(self, action: Callable[[], None]) -> None:
-        try:
-            action()
-        except ValueError as error:  # too many faults at a time
-            raise BenchError(f"at bus time {self.wire.now_ns / 1e9:.6f} s: {error}") from error
+    def _give_up(self, error: ValueError) -> None:
+        """End a run with too many faults at a time."""
+        raise BenchError(f"at bus time {self.wire.now_ns / 1e9:.6f} s: {error}") from error
 
     def _advance(self, step: Callable[[], None]) -> None:
         begin_s = time.perf_counter()
