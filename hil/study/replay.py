@@ -20,7 +20,8 @@ from dbc.messages import BenchCommand
 from dbc.node import PERIOD_NS
 from dbc.profile2 import MAX_COUNTER
 from firmware_py.calibration import Calibration
-from firmware_py.node import EXECUTION_NS, PHASE_NS, Controller
+from firmware_py.chosen_firmware import ChosenFirmware
+from firmware_py.node import PHASE_NS, Controller
 from hil.bus.wire import Clock
 from hil.bus.wire_time import INTERMISSION_BITS, traffic_bits
 from hil.bus_log import RESOLUTION_NS
@@ -173,6 +174,7 @@ def replay(
     calibration: Calibration,
     bit_rate: int,
     law: int | None = None,
+    firmware: ChosenFirmware | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Replay:
     """Feed a recorded bus to a new controller and compare what it sends with what is recorded.
@@ -189,6 +191,8 @@ def replay(
         Bit/s of the recorded bus; it matters only where the timer's phase has to be inferred.
     law : int, optional
         Control law that takes the place of the recorded one in every intact ControllerCommand.
+    firmware : ChosenFirmware, optional
+        What runs the controller, and how long a control period takes on it; Python if not given.
     progress : callable
         Told the share of the log that is done.
 
@@ -199,7 +203,8 @@ def replay(
     """
     is_error = traffic[:, 1] & np.uint64(ERR_FLAG) != 0
     data_frames = traffic[~is_error]
-    controller = Controller(contract, calibration.to_bytes())
+    firmware = firmware or ChosenFirmware()
+    controller = firmware.controller(contract, calibration.to_bytes())
     resets = _resets_in(data_frames, contract)
     if not resets.size:
         raise BenchError(
@@ -210,7 +215,7 @@ def replay(
     commands = heard[heard[:, 1] == contract.drive_command.can_id]
     if not len(commands):
         raise BenchError("there is no DriveCommand after the reset in the log: nothing to compare with")
-    phase = _phase_of(heard[resets - resets[0], 0], commands, bit_rate)
+    phase = _phase_of(heard[resets - resets[0], 0], commands, bit_rate, firmware.execution_ns)
     inputs = heard[np.isin(heard[:, 1], list(controller.accepts))]
     if law is not None:
         inputs = _under_law(inputs, contract, law)
@@ -242,12 +247,12 @@ def _resets_in(frames: np.ndarray, contract: Contract) -> np.ndarray:
     )
 
 
-def _phase_of(resets_ns: np.ndarray, commands: np.ndarray, bit_rate: int) -> TimerPhase:
+def _phase_of(resets_ns: np.ndarray, commands: np.ndarray, bit_rate: int, execution_ns: int) -> TimerPhase:
     """Return the timer's phase: known where resets come at whole periods, as on a simulated bus."""
     offset_ns = (resets_ns.astype(np.int64) + PERIOD_NS // 2) % PERIOD_NS - PERIOD_NS // 2
     if (np.abs(offset_ns) <= RESOLUTION_NS).all():
         return TimerPhase(PHASE_NS, exact=True)
-    offset_ns = np.sort(_latest_timer_ns(commands, bit_rate) % PERIOD_NS)
+    offset_ns = np.sort(_latest_timer_ns(commands, bit_rate, execution_ns) % PERIOD_NS)
     twice = np.concatenate([offset_ns, offset_ns + PERIOD_NS])
     followers = np.searchsorted(twice, offset_ns + PERIOD_NS // 2) - np.arange(len(offset_ns))
     best = int(followers.argmax())
@@ -259,10 +264,10 @@ def _phase_of(resets_ns: np.ndarray, commands: np.ndarray, bit_rate: int) -> Tim
     return TimerPhase(int(offset_ns[best]), exact=False)
 
 
-def _latest_timer_ns(commands: np.ndarray, bit_rate: int) -> np.ndarray:
+def _latest_timer_ns(commands: np.ndarray, bit_rate: int, execution_ns: int) -> np.ndarray:
     """Return when the timer behind each command fired at the latest: it met an idle bus then."""
     wire_ns = (traffic_bits(commands)[:, 0] - INTERMISSION_BITS) * 1_000_000_000 // bit_rate
-    latest_ns: np.ndarray = commands[:, 0].astype(np.int64) - wire_ns - EXECUTION_NS
+    latest_ns: np.ndarray = commands[:, 0].astype(np.int64) - wire_ns - execution_ns
     return latest_ns
 
 

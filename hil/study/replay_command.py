@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dbc.contract import Contract
+from firmware_py.chosen_firmware import add_firmware_argument, firmware_of_text
 from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from hil.report import BLUE, GREY, ORANGE, RED, ResultFolder
 from hil.run.options import BenchError, check_bit_rate
@@ -48,6 +49,7 @@ def add_command(commands: Any) -> None:
         "--controller", choices=CONTROLLERS, metavar="LAW", help=f"{laws} (default: the log's)"
     )
     add_tuning_arguments(replay)
+    add_firmware_argument(replay)
     replay.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
     replay.add_argument("-c", "--channel", metavar="C", help="of a log that has more than one")
     replay.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s (default: the DBC's)")
@@ -63,6 +65,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     contract = Contract.load(arguments.dbc)
     bit_rate = arguments.bitrate if arguments.bitrate is not None else contract.bitrate
     check_bit_rate(bit_rate)
+    firmware = firmware_of_text(arguments.firmware)
     law = None if arguments.controller is None else law_of(arguments.controller)
     with Console(stderr=True).status(f"reading {arguments.log}") as status:
         log = read_bus_log(arguments.log, arguments.channel)
@@ -71,13 +74,14 @@ def _replay(arguments: argparse.Namespace) -> int:
             status.update(f"replaying {arguments.log}: {share:.0%}")
 
         try:
-            replayed = replay(log.traffic, contract, tuning.calibration, bit_rate, law, advance)
+            replayed = replay(log.traffic, contract, tuning.calibration, bit_rate, law, firmware, advance)
         except BenchError as error:
             raise BenchError(f"{arguments.log}: {error}") from error
     result = {
         "log": str(arguments.log),
         "tuning": tuning.name,
         "controller": arguments.controller,
+        "firmware": firmware.text,
         **figures_of(replayed, contract),
         "passed_over": {"error": replayed.error_frames, **log.left_out},
     }

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from dbc.contract import Contract
 from dbc.frame import ERR_FLAG, Frame
 from dbc.node import PERIOD_NS
+from firmware_py.chosen_firmware import firmware_of_text
 from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.node import PHASE_NS
 from hil import cli
@@ -341,6 +342,15 @@ def test_exit_code_1_comes_with_the_first_difference_in_signals(log, tmp_path, c
     said = capsys.readouterr().out
     assert f"first difference of DriveCommand: {time[1:-1]} s" in said
     assert f"TargetVelocity    {(velocity + 4) / 4:g} rpm" in said
+
+
+def test_another_firmware_is_compared_with_its_execution_time(tmp_path):
+    firmware, path = "cortex-m4,execution_us=32.0", tmp_path / "bus.log"
+    options = RunOptions(SHORT, "scheduled", record_directory=tmp_path, firmware=firmware_of_text(firmware))
+    write_bus_log(path, run_inprocess(options).traffic)
+    assert cli.main(["replay", str(path), "--firmware", firmware]) == 0
+    assert cli.main(["replay", str(path), "--firmware", "python,execution_us=32"]) == 0
+    assert cli.main(["replay", str(path)]) == 1, "the execution time in ControllerStatus"
 
 
 def test_the_guide_shows_what_is_printed(tmp_path, capsys, monkeypatch):
