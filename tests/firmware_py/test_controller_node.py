@@ -292,7 +292,7 @@ def test_a_faulty_drive_gets_no_voltage_until_a_reset_is_asked_for(standby):
     assert standby.period().controlword == RESET
 
 
-@pytest.mark.parametrize("statusword", [0x0219, 0x021A, 0x021C, 0x0258])
+@pytest.mark.parametrize("statusword", [0x0219, 0x021A, 0x021C, 0x0241, 0x0258])
 def test_a_statusword_of_no_state_gets_no_voltage_and_no_reset(standby, statusword):
     set_inputs(standby, statusword=statusword, enable=1, fault_reset=1)
     assert standby.period().controlword == DISABLE_VOLTAGE
