@@ -1,7 +1,7 @@
 """Extended state observer (eq. 26 with a linear zone): position, speed, acceleration, total disturbance."""
 
 from dbc.machine import Array32, i64, int32
-from firmware_py.kernel.fal import fal_1_2
+from firmware_py.kernel.fal import fal, octaves_beyond
 from firmware_py.kernel.fixedpoint import gain, round_shift, sat32, store
 from firmware_py.kernel.layout import (
     CAL_ESO_A1,
@@ -36,8 +36,9 @@ def eso_step(calibration: Array32, state: Array32, position: int32) -> None:
     z4 = i64(state[ST_Z4])
     delta = calibration[CAL_ESO_DELTA]
     e = sat32(z1 - i64(position))
-    fal_1_4 = fal_1_2(fal_1_2(e, delta), delta)
-    fal_1_8 = fal_1_2(fal_1_4, delta)
+    octaves = octaves_beyond(e, delta)
+    fal_1_4 = fal(e, delta, octaves >> 2)
+    fal_1_8 = fal(e, delta, octaves >> 3)
     store(state, ST_Z1, z1 + round_shift(i64(z2), 7) - gain(calibration, CAL_ESO_BETA1, e))
     store(state, ST_Z2, i64(z2) + round_shift(i64(z3), 2) - gain(calibration, CAL_ESO_BETA2, e))
     model = gain(calibration, CAL_ESO_A1, z2) + gain(calibration, CAL_ESO_A2, z3)

@@ -65,13 +65,26 @@ def compiled_sat32(value):
 
 
 @numba.njit
-def compiled_fal_1_2(e, delta):
-    return fal.fal_1_2(e, delta)
+def compiled_fal_1_8(e, delta):
+    return fal.fal(e, delta, fal.octaves_beyond(e, delta) >> 3)
+
+
+@numba.njit
+def compiled_fal_1_4(e, delta):
+    return fal.fal(e, delta, fal.octaves_beyond(e, delta) >> 2)
 
 
 @numba.njit
 def compiled_fal_3_4(e, delta):
     return fal.fal_3_4(e, delta)
+
+
+def checked_fal_1_8(e, delta):
+    return MODULES["fal"].fal(e, delta, MODULES["fal"].octaves_beyond(e, delta) >> 3)
+
+
+def checked_fal_1_4(e, delta):
+    return MODULES["fal"].fal(e, delta, MODULES["fal"].octaves_beyond(e, delta) >> 2)
 
 
 @numba.njit
@@ -113,11 +126,17 @@ DIV32 = pytest.mark.parametrize(
 MUL_Q = pytest.mark.parametrize("mul_q", [narrow(FIXED.mul_q), compiled_mul_q], ids=["checked", "compiled"])
 GAIN = pytest.mark.parametrize("gain", [checked_gain, compiled_gain], ids=["checked", "compiled"])
 SAT32 = pytest.mark.parametrize("sat32", [wide(FIXED.sat32), compiled_sat32], ids=["checked", "compiled"])
-FAL_1_2 = pytest.mark.parametrize(
-    "fal_1_2", [narrow(MODULES["fal"].fal_1_2), compiled_fal_1_2], ids=["checked", "compiled"]
-)
-FAL_3_4 = pytest.mark.parametrize(
-    "fal_3_4", [narrow(MODULES["fal"].fal_3_4), compiled_fal_3_4], ids=["checked", "compiled"]
+FAL = pytest.mark.parametrize(
+    ("alpha", "power"),
+    [
+        (1 / 8, narrow(checked_fal_1_8)),
+        (1 / 4, narrow(checked_fal_1_4)),
+        (3 / 4, narrow(MODULES["fal"].fal_3_4)),
+        (1 / 8, compiled_fal_1_8),
+        (1 / 4, compiled_fal_1_4),
+        (3 / 4, compiled_fal_3_4),
+    ],
+    ids=[f"{alpha}-{how}" for how in ("checked", "compiled") for alpha in ("1/8", "1/4", "3/4")],
 )
 FHAN = pytest.mark.parametrize("fhan", [wide(MODULES["td"].fhan), compiled_fhan], ids=["checked", "compiled"])
 
@@ -254,45 +273,67 @@ def test_sat32_keeps_what_fits_and_clips_the_rest(sat32, value):
     assert sat32(value) == min(max(value, -(2**31)), 2**31 - 1)
 
 
-@FAL_1_2
+@FAL
 @given(e=INT32, delta=POSITIVE32)
 @example(e=-(2**31), delta=1)
 @example(e=-(2**31), delta=2**31 - 1)
-def test_fal_1_2_is_linear_up_to_delta_and_a_root_beyond(fal_1_2, e, delta):
-    magnitude = abs(e) if abs(e) <= delta else math.isqrt(abs(e) * delta)
-    assert fal_1_2(e, delta) == int(math.copysign(magnitude, e))
-
-
-@FAL_3_4
-@given(e=INT32, delta=POSITIVE32)
-def test_fal_3_4_is_within_its_roots_rounding(fal_3_4, e, delta):
-    result = fal_3_4(e, delta)
+@example(e=2**31 - 1, delta=2**31 - 2)
+def test_fal_is_linear_up_to_delta_and_the_real_power_to_1e_5_beyond(alpha, power, e, delta):
+    result = power(e, delta)
     if abs(e) <= delta:
         assert result == e
         return
-    exact = delta * (abs(e) / delta) ** 0.75
+    exact = delta * (abs(e) / delta) ** alpha
+    assert exact * (1 - 1e-5) - 1 <= abs(result) <= exact * (1 + 1e-5)
+    assert delta <= abs(result) <= abs(e)
     assert result * e > 0
-    # the inner root is at least delta and may be 1 too low, the outer one again
-    assert exact * (1 - 0.5 / delta) - 1 - 1e-6 * exact <= abs(result) <= exact * (1 + 1e-9)
 
 
+@FAL
+@given(e=INT32, step=st.integers(0, 2**12), delta=POSITIVE32)
+def test_fal_is_monotonic(alpha, power, e, step, delta):
+    assert power(e, delta) <= power(min(e + step, 2**31 - 1), delta)
+
+
+@FAL
 @pytest.mark.parametrize("delta", [1, 7, 214748, 2**31 - 2])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_fal_is_continuous_at_delta(delta, sign):
-    for function in (narrow(MODULES["fal"].fal_1_2), narrow(MODULES["fal"].fal_3_4)):
-        assert function(sign * delta, delta) == sign * delta
-        assert 0 <= sign * function(sign * (delta + 1), delta) - delta <= 1
+def test_fal_is_continuous_at_delta(alpha, power, delta, sign):
+    assert power(sign * delta, delta) == sign * delta
+    assert 0 <= sign * power(sign * (delta + 1), delta) - delta <= 1
 
 
-@FAL_1_2
-@pytest.mark.parametrize("e_m", [1.01e-4, 5e-4, 0.01, 0.3])
-def test_chained_halves_make_the_observers_exponents(fal_1_2, e_m):
-    delta_m = 1e-4
-    delta, e = round(delta_m * 2**31), round(e_m * 2**31)
-    quarter = fal_1_2(fal_1_2(e, delta), delta)
-    eighth = fal_1_2(quarter, delta)
-    assert quarter / 2**31 == pytest.approx(delta_m * (e_m / delta_m) ** (1 / 4), rel=2e-5)
-    assert eighth / 2**31 == pytest.approx(delta_m * (e_m / delta_m) ** (1 / 8), rel=2e-5)
+def test_the_tables_are_the_functions_rounded():
+    assert tuple(round(2**22 * math.log2(1 + n / 128)) for n in range(129)) == fal.LOG2
+    assert tuple(round(2**22 * 2 ** (n / 128)) for n in range(129)) == fal.EXP2
+
+
+@numba.njit
+def furthest_from_the_power(delta, octave, eighths):
+    """Relative errors, least and most, at each mantissa of 23 bits of an octave; 1 where fal falls."""
+    least, most, last = 0.0, 0.0, 0
+    for mantissa in range(2**22, 2**23):
+        e = (mantissa << octave) >> 22
+        if e > delta:
+            octaves = fal.octaves_beyond(e, delta)
+            if eighths == 6:
+                result = fal.fal_3_4(e, delta)
+            else:
+                result = fal.fal(e, delta, octaves >> (3 if eighths == 1 else 2))
+            exact = delta * (e / delta) ** (eighths / 8)
+            least, most = min(least, (result + 1 - exact) / exact), max(most, (result - exact) / exact)
+            if result < last:
+                return -1.0, 1.0
+            last = result
+    return least, most
+
+
+@pytest.mark.parametrize("eighths", [1, 2, 6])
+@pytest.mark.parametrize("delta", [1000, 214_748, 10_995_116])
+def test_every_mantissa_is_within_1e_5_of_the_power_and_not_below_the_last(delta, eighths):
+    for octave in (23, 24, 27, 30):
+        least, most = furthest_from_the_power(delta, octave, eighths)
+        assert -1e-5 < least <= most < 1e-5
 
 
 def fhan_in_floats(x1, x2, r, h):

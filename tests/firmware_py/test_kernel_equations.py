@@ -19,7 +19,6 @@ from firmware_py.kernel import (
     command_filter,
     control,
     eso,
-    fal,
     fixedpoint,
     front_end,
     limiter,
@@ -30,6 +29,7 @@ from firmware_py.kernel import (
     td,
     units,
 )
+from firmware_py.kernel import fal as powers
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import TUNINGS
 
@@ -91,12 +91,33 @@ class Case:
         assert self.state == wanted
 
 
-def fal_1_2(e, delta):
-    return e if abs(e) <= delta else int(math.copysign(math.isqrt(abs(e) * delta), e))
+def straight(function, x):
+    """The function in 2^-22, rounded at each 128th of its unit, straight between, rounded down."""
+    place, rest = divmod(x * 128, 1)
+    left, right = (round(2**22 * function((int(place) + n) / 128)) for n in (0, 1))
+    return left + math.floor((right - left) * rest)
+
+
+def log2(value):
+    """Of the leading 23 bits, in 2^-22."""
+    octave = value.bit_length() - 1
+    leading = Fraction(math.floor(Fraction(value, 2**octave) * 2**22), 2**22)
+    return octave * 2**22 + straight(lambda x: math.log2(1 + x), leading - 1)
+
+
+def fal(e, delta, alpha):
+    magnitude = min(abs(e), HIGH)
+    if magnitude <= delta:
+        return e
+    beyond = log2(magnitude) - log2(delta)
+    exponent = beyond - math.floor(beyond * Fraction(1, 4)) if alpha == 0.75 else math.floor(beyond * alpha)
+    octaves, rest = divmod(exponent, 2**22)
+    power = math.floor(delta * 2**octaves * Fraction(straight(lambda x: 2**x, Fraction(rest, 2**22)), 2**22))
+    return int(math.copysign(min(power, magnitude), e))
 
 
 def fal_3_4(e, delta):
-    return e if abs(e) <= delta else int(math.copysign(math.isqrt(abs(e) * math.isqrt(abs(e) * delta)), e))
+    return fal(e, delta, 0.75)
 
 
 # the layout is the calibration block's format and the trace's
@@ -199,11 +220,28 @@ def test_the_count_of_saturations_itself_saturates():
     assert state[k.ST_SATURATIONS] == HIGH
 
 
-@pytest.mark.parametrize("delta", [1, 2, 3, 100])
-def test_fal_is_the_identity_up_to_delta_and_its_roots_beyond(delta):
-    for e in [*range(-2 * delta - 9, 2 * delta + 9), 12_345, -12_345]:
-        assert fal.fal_1_2(e, delta) == fal_1_2(e, delta)
-        assert fal.fal_3_4(e, delta) == fal_3_4(e, delta)
+def test_log2_at_each_128th_of_each_octave_and_beside_it():
+    knots = {mantissa << octave >> 7 for mantissa in range(128, 256) for octave in range(31)}
+    for value in {near for knot in knots for near in (knot - 1, knot, knot + 1)} - {0}:
+        assert powers.log2(value) == log2(value), value
+
+
+def test_magnitude_saturates():
+    assert [powers.magnitude_of(e) for e in (LOW, LOW + 1, -1, 0, 1, HIGH)] == [HIGH, HIGH, 1, 0, 1, HIGH]
+
+
+@pytest.mark.parametrize("delta", [1, 2, 3, 100, 214_748, 2**30 - 1, HIGH - 1, HIGH])
+def test_fal_is_the_identity_up_to_delta_and_a_power_beyond(delta):
+    rng = np.random.default_rng(delta)
+    near = [*range(min(delta, HIGH - 200), min(delta + 200, HIGH)), *range(100), HIGH]
+    for e in {*near, *rng.integers(0, HIGH, 200).tolist()}:
+        for signed in (e, -e):
+            octaves = powers.octaves_beyond(signed, delta)
+            assert octaves == (log2(e) - log2(delta) if e > delta else 0)
+            assert powers.fal(signed, delta, octaves >> 2) == fal(signed, delta, 0.25)
+            assert powers.fal(signed, delta, octaves >> 3) == fal(signed, delta, 0.125)
+            assert powers.fal_3_4(signed, delta) == fal_3_4(signed, delta)
+    assert powers.fal_3_4(LOW, delta) == fal_3_4(LOW, delta)
 
 
 @pytest.mark.parametrize(
@@ -288,8 +326,8 @@ def test_extended_state_observer(seed):
     z1, z2, z3, z4 = case.before[k.ST_Z1 : k.ST_Z4 + 1]
     delta = case.words[k.CAL_ESO_DELTA]
     e = z1 - case.position
-    e_1_4 = fal_1_2(fal_1_2(e, delta), delta)
-    e_1_8 = fal_1_2(e_1_4, delta)
+    e_1_4 = fal(e, delta, 0.25)
+    e_1_8 = fal(e, delta, 0.125)
     model = case.gain(k.CAL_ESO_A1, z2) + case.gain(k.CAL_ESO_A2, z3) + to(z4, "j", "a")
     drive = case.gain(k.CAL_ESO_B0, case.before[k.ST_U])
     eso.eso_step(case.words, case.state, case.position)
