@@ -37,8 +37,8 @@ class PiTuning:
 class AdrcTuning:
     """ADRC with bandwidth gains; the defaults are the ones the paper's design was completed with.
 
-    The exponents of fal are part of the kernel (1/4 and 1/8 in the observer, 3/4 in the feedback): its
-    integer square roots make them. A very wide linear zone makes a linear controller.
+    The exponents of fal are part of the kernel (1/4 and 1/8 in the observer, 3/4 in the feedback): shifts of
+    a logarithm make them. A very wide linear zone makes a linear controller.
     """
 
     r0_m_s2: float = 25.0

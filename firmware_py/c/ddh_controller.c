@@ -542,7 +542,7 @@ static const int32_t DDH_EXP2[129] = {
 };
 
 /* Compute log2 of value > 0, in 2^-22. */
-static int32_t log2(int32_t value)
+static int32_t log2_q22(int32_t value)
 {
     int32_t zeros = clz((int64_t)(value & DDH_INT32_MAX)) - 32;
     int32_t mantissa = shl32(value, zeros - 1);
@@ -571,7 +571,7 @@ static int32_t octaves_beyond(int32_t e, int32_t delta)
     if (magnitude <= delta) {
         return 0;
     }
-    return (int32_t)(log2(magnitude) - log2(delta));
+    return (int32_t)(log2_q22(magnitude) - log2_q22(delta));
 }
 
 /* Compute sign(e) delta 2^octaves outside the linear zone, e in it.

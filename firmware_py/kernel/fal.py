@@ -41,7 +41,7 @@ EXP2 = (  # 2^22 2^(n / 128)
 # fmt: on
 
 
-def log2(value: int32) -> int32:
+def log2_q22(value: int32) -> int32:
     """Compute log2 of `value` > 0, in 2^-22."""
     zeros = clz(i64(value & INT32_MAX)) - 32
     mantissa = value << (zeros - 1)
@@ -65,7 +65,7 @@ def octaves_beyond(e: int32, delta: int32) -> int32:
     magnitude = magnitude_of(e)
     if magnitude <= delta:
         return 0
-    return i32(log2(magnitude) - log2(delta))
+    return i32(log2_q22(magnitude) - log2_q22(delta))
 
 
 def fal(e: int32, delta: int32, octaves: int32) -> int32:

@@ -56,7 +56,7 @@ def sine_inputs(controller: str, periods: int) -> Inputs:
 
 
 def jump_inputs(count: int = JUMPS) -> Inputs:
-    """Return setpoints and positions anywhere on the stroke, so that no linear zone saves a square root."""
+    """Return setpoints and positions anywhere on the stroke, so that no linear zone saves a power."""
     rng = np.random.default_rng(JUMPS_SEED)
     setpoints, positions = rng.integers(0, 4_000_000, count), rng.integers(0, 400_000, count)
     return list(zip(setpoints.tolist(), positions.tolist(), strict=True))

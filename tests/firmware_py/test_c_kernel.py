@@ -142,7 +142,7 @@ VECTORS = {
     "mul_q": [NARROW, NARROW, SHIFTS],
     "isqrt": [AROUND_SQUARES],
     "isqrt_61": [[value for value in AROUND_SQUARES if 0 < value < 2**61]],
-    "log2": [[*DELTAS, 127, 128, 129, 2**30 - 1, 2**30]],
+    "log2_q22": [[*DELTAS, 127, 128, 129, 2**30 - 1, 2**30]],
     "magnitude_of": [NARROW],
     "octaves_beyond": [[*NARROW, *DELTAS, *(-delta for delta in DELTAS)], DELTAS],
     "fal": [[*NARROW, *DELTAS, *(-delta for delta in DELTAS)], DELTAS, [0, 1, 2**15 - 1, 2**15, 2**22 - 1]],

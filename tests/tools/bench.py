@@ -3,7 +3,7 @@
 Every subject is run once to warm up, then in interleaved rounds, so that a noisy machine disturbs all alike;
 the median over the rounds counts. Multiples of real time are simulated seconds over wall seconds, without
 start-up and output files. Costs per step are of the jitted control step alone, replayed over the inputs of
-the scenario ("worst": random setpoints and positions, so that no linear zone saves a square root). A plain
+the scenario ("worst": random setpoints and positions, so that no linear zone saves a power). A plain
 Python loop is timed in each round too, to compare machines by.
 
 Lateness is of a 1 ms timer under the same scheduler, once in a bare loop (sleep to 200 µs before an absolute

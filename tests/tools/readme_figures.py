@@ -57,7 +57,7 @@ SPEED_ROWS = (  # figure of bench.json, what it is, unit, format
     ("lockstep_x", "three processes in lock-step, over the bus", "x real time", ".1f"),
     ("jitted_loop_x", "kernel and plant in one compiled loop, no bus", "x real time", ".0f"),
     ("adrc_step_sine_us", "one ADRC step, over the sine", "µs", ".3f"),
-    ("adrc_step_worst_us", "one ADRC step, random inputs (all roots)", "µs", ".3f"),
+    ("adrc_step_worst_us", "one ADRC step, random inputs (all powers)", "µs", ".3f"),
     ("pi_step_sine_us", "one PI step, over the sine", "µs", ".3f"),
     ("bare_late_p50_us", "lateness of a 1 ms timer, bare loop, median", "µs", ".1f"),
     ("bare_late_p99_us", "lateness of a 1 ms timer, bare loop, p99", "µs", ".1f"),
