@@ -244,6 +244,13 @@ def test_fal_is_the_identity_up_to_delta_and_a_power_beyond(delta):
     assert powers.fal_3_4(LOW, delta) == fal_3_4(LOW, delta)
 
 
+def test_fal_is_never_beyond_e():
+    """Next to a delta of 31 bits the logarithm's LSB is 256 of fal's."""
+    delta = 1_073_742_591
+    for signed in (1, -1):
+        assert powers.fal_3_4(signed * (delta + 1), delta) == signed * (delta + 1)
+
+
 @pytest.mark.parametrize(
     ("convert", "factor"),
     [
