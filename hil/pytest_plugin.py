@@ -91,6 +91,8 @@ def pytest_configure(config: pytest.Config) -> None:
         raise pytest.UsageError("--hil-interface needs --hil-mode realtime")
     if _ratio(config) != 1 and config.getoption("hil_mode") != "realtime":
         raise pytest.UsageError("--rt-ratio needs --hil-mode realtime: virtual time has no pace")
+    if config.getoption("hil_firmware") != "python":
+        _firmware(config)  # refused before a test begins, in one line
 
 
 def interface_of(config: pytest.Config) -> str:

@@ -22,6 +22,7 @@ from hil.scenario import TimingLimits
 
 ROOT = Path(__file__).parents[2]
 DOCS = (ROOT / "docs/testing.md").read_text(encoding="utf-8")
+FAULTS = (ROOT / "docs/faults.md").read_text(encoding="utf-8")
 
 USER_TESTS = """
 import pytest
@@ -233,6 +234,7 @@ def test_only_what_was_selected_is_counted(tmp_path):
         (["--rt-ratio=0.1"], "--rt-ratio needs --hil-mode realtime"),
         (["--hil-mode=realtime", "--rt-ratio=0"], "--rt-ratio: "),
         (["--hil-mode=realtime", "--rt-ratio=fast"], "--rt-ratio: "),
+        (["--hil-firmware=cortex-m9"], "--hil-firmware: there is no firmware 'cortex-m9'"),
         (["--hil-mode=fast"], "argument --hil-mode: invalid choice: 'fast'"),
     ],
 )
@@ -281,15 +283,16 @@ def test_a_lost_process_fails_its_test_only(tmp_path):
     assert [line for line in session.lines if re.fullmatch(said, line)], session.said
 
 
-# docs/testing.md
+# docs/testing.md, docs/faults.md
 
 
-def code_blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", DOCS, re.DOTALL)
+def code_blocks(language: str, page: str = DOCS) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
 
 
-def test_the_example_in_the_documentation_passes(tmp_path):
-    (example,) = code_blocks("python")
+@pytest.mark.parametrize("page", [DOCS, FAULTS], ids=["testing.md", "faults.md"])
+def test_the_example_in_the_documentation_passes(tmp_path, page):
+    (example,) = code_blocks("python", page)
     session = user_session(tmp_path, example, "--hil-mode=inprocess")
     assert session.code == 0, session.said
     assert f"{example.count('def test_')} passed" in session.said
