@@ -32,9 +32,11 @@ def add_command(commands: Any) -> None:
         "--write", action="store_true", help="measure, and keep it as the figures to compare with"
     )
     parser.add_argument(
-        "--periods", type=int, default=MOST_PERIODS, metavar="N", help="of the sine (default 10000, all)"
+        "--periods", type=int, default=MOST_PERIODS, metavar="N", help="to measure of the sine (10000, all)"
     )
-    parser.add_argument("--clock-mhz", type=float, metavar="F", help="for the share of the period")
+    parser.add_argument(
+        "--clock-mhz", type=float, metavar="F", help="clock in MHz for the share of the period"
+    )
     parser.add_argument("--json", action="store_true", help="print all figures")
 
 
@@ -42,6 +44,8 @@ def cost(arguments: argparse.Namespace) -> int:
     """Show the bill."""
     if not 1 <= arguments.periods <= MOST_PERIODS:
         raise BenchError(f"--periods is {arguments.periods}, must be from 1 to {MOST_PERIODS}")
+    if arguments.periods != MOST_PERIODS and not (arguments.measure or arguments.write):
+        raise BenchError("--periods needs --measure: what was measured is of all periods")
     if arguments.clock_mhz is not None:
         check_clock(arguments.clock_mhz)
     if arguments.measure or arguments.write:
@@ -113,8 +117,10 @@ HEADINGS = (
 
 def _table(figures: dict[str, Any], clock_mhz: float | None) -> Table:
     table = Table(title=f"{figures['compiler']}; cycles are an estimate")
-    for number, heading in enumerate(HEADINGS):
-        table.add_column(heading, justify="left" if number < 2 else "right")
-    for row in rows(figures, clock_mhz):
+    bill = rows(figures, clock_mhz)
+    for number, column in enumerate(zip(HEADINGS, *bill, strict=True)):
+        longest = max(len(word) for text in column for word in text.split())  # a figure is never cut
+        table.add_column(HEADINGS[number], justify="left" if number < 2 else "right", width=longest)
+    for row in bill:
         table.add_row(*row)
     return table
