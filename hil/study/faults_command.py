@@ -15,7 +15,7 @@ from hil.faults.catalogue import KINDS
 from hil.report import ResultFolder
 from hil.run.options import BenchError, InterruptedRunError
 from hil.run.stopping import StopFlag
-from hil.study.fault_matrix import PHASES, Case, load_matrix
+from hil.study.fault_matrix import PHASES, Case, MatrixError, load_matrix
 
 if TYPE_CHECKING:
     from hil.study.fault_runs import Played
@@ -91,7 +91,11 @@ def _cases(arguments: argparse.Namespace) -> list[Case]:
     except (OSError, UnicodeDecodeError) as error:
         raise BenchError(f"cannot read the matrix {arguments.matrix}: {error}") from error
     kinds, phases = arguments.fault or KINDS, arguments.phase or PHASES
-    cases = [case for case in load_matrix(text) if case.fault.kind in kinds and case.phase in phases]
+    try:
+        matrix = load_matrix(text)
+    except MatrixError as error:
+        raise MatrixError(f"{arguments.matrix}: {error}") from error
+    cases = [case for case in matrix if case.fault.kind in kinds and case.phase in phases]
     if not cases:
         raise BenchError("the matrix has no such case")
     return cases
@@ -110,9 +114,9 @@ def _print(matrix: dict[str, Any], played: "Sequence[Played]") -> None:
 
     unexpected = [one for one in played if one.complaints]
     table = Table(title=f"{len(played)} cases under {matrix['tuning']}, {len(unexpected)} not as expected")
-    table.add_column("fault", overflow="fold", min_width=28)
-    table.add_column("noticed by")
-    table.add_column("reaction")
+    table.add_column("fault", overflow="fold", min_width=26)  # all four fit into 80 columns
+    table.add_column("noticed by", max_width=15)
+    table.add_column("reaction", max_width=15)
     table.add_column("as expected", justify="right")
     for faults in grouped(matrix).values():
         for name, cases in faults.items():

@@ -21,6 +21,7 @@ from hil.study.fault_runs import Played, matrix_of, play_case, play_matrix
 from hil.study.runs import all_cores
 
 DOCS = Path(__file__).parents[3] / "docs" / "fault_matrix.md"
+NO_MATRIX = Path(__file__).parents[3] / "README.md"
 CASES = load_matrix()
 NUMBER = re.compile(r"(?<![\w=.])\d+(?:\.\d+)?(?= of| ms| mm)")
 
@@ -224,11 +225,22 @@ def test_the_command_line_says_what_is_not_as_expected(tmp_path, capsys):
     assert "NOT AS EXPECTED" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_the_table_fits_a_narrow_terminal(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    arguments = ["faults", "--fault", "drop", "--phase", "standby", "--jobs", "1", "--out", str(tmp_path)]
+    assert cli.main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "as expected" in said
+    assert "message=ControllerCommand," in said
+    assert max(map(len, said.splitlines()[:-1])) <= 80
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
         (["--jobs", "0"], "--jobs is 0, must be 1 or more"),
         (["--matrix", "nowhere.toml"], "cannot read the matrix nowhere.toml"),
+        (["--matrix", str(NO_MATRIX)], f"{NO_MATRIX}: fault matrix: Expected '='"),
         (["--tuning", "sporty"], "there is no tuning 'sporty'"),
         (["--fault", "gremlin"], "gremlin"),
         (["--phase", "lunch"], "lunch"),
