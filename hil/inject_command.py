@@ -42,7 +42,9 @@ def add_command(commands: Any) -> None:
     inject.add_argument("faults", nargs="+", help=argparse.SUPPRESS)
     inject.add_argument("-i", "--interface", default="hilbus", metavar="I", help="default hilbus")
     inject.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s, for adapters that set it")
-    inject.add_argument("--dbc", type=Path, metavar="FILE", help="another DBC than the packaged ddh.dbc")
+    inject.add_argument(
+        "--dbc", type=Path, metavar="FILE", help="not on hilbus: another DBC than the packaged ddh.dbc"
+    )
 
 
 def take_faults(hub: Hub) -> None:
