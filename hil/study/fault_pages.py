@@ -137,7 +137,13 @@ def draw(path: Path, played: Sequence[Played]) -> None:
             position.set_ylabel("position / mm")
             speed.set_ylabel("speed / rpm")
     axes[0, 0].legend(fontsize="small")
-    for axis in axes[-1]:
+    for unused in range(len(played), rows * columns):
+        row, column = divmod(unused, columns)
+        axes[2 * row, column].remove()
+        axes[2 * row + 1, column].remove()
+    for lowest in range(max(0, len(played) - columns), len(played)):
+        axis = axes[2 * (lowest // columns) + 1, lowest % columns]
         axis.set_xlabel("time from the fault / ms")
+        axis.tick_params(labelbottom=True)
     picture.savefig(path, metadata={"Date": None})
     pyplot.close(picture)

@@ -225,6 +225,16 @@ def test_the_command_line_says_what_is_not_as_expected(tmp_path, capsys):
     assert "NOT AS EXPECTED" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_the_picture_has_no_empty_axes(tmp_path):
+    kinds = ["--fault", "drop", "--fault", "sensor_bias", "--fault", "reset"]
+    assert cli.main(["faults", *kinds, "--phase", "tracking", "--jobs", "1", "--out", str(tmp_path)]) == 0
+    drawn = [
+        case for case in CASES if case.fault.kind in kinds and case.phase == "tracking" and case.is_drawn
+    ]
+    assert len(drawn) == 4  # one in the second row of three
+    assert len(re.findall(r'id="axes_\d+"', (tmp_path / "courses.svg").read_text())) == 2 * len(drawn)
+
+
 def test_the_table_fits_a_narrow_terminal(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     arguments = ["faults", "--fault", "drop", "--phase", "standby", "--jobs", "1", "--out", str(tmp_path)]
