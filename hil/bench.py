@@ -14,7 +14,6 @@ from firmware_py.diagnosis import State as ControllerState
 from hil.bus.wire import ErrorState
 from hil.faults.catalogue import fault_of
 from hil.faults.fault import Fault as InjectedFault
-from hil.faults.machine import MAX_LOAD_N
 from hil.measure import M_TO_MM, Trace, bus_load_of_windows, figures_of, setting_of, timing_in, trace_of
 from hil.report import OutputDirectory
 from hil.run.options import BenchError, Recording
@@ -23,7 +22,7 @@ from hil.scenario import PERIOD_S, TimingLimits, controller_of
 from hil.signals import Series, signal_of
 from hil.supervisor import BRING_UP_PERIODS, Reference
 from hil.timing import Figure, Timing
-from plant_sim.parameters import PlantParameters
+from plant_sim.parameters import MAX_LOAD_N, PlantParameters
 
 STROKE_M = PlantParameters().stroke_m
 

@@ -13,11 +13,10 @@ import numpy as np
 from dbc.node import PERIOD_NS
 from hil.faults.catalogue import fault_of_table
 from hil.faults.fault import LONGEST_S, Fault, FaultError
-from hil.faults.machine import MAX_LOAD_N
 from hil.references import REFERENCES
 from hil.toml_lines import KeyPath, line_of
 from plant_sim.machine import Machine
-from plant_sim.parameters import ParameterError
+from plant_sim.parameters import MAX_LOAD_N, ParameterError
 
 CONTROLLERS = ("p", "pi", "adrc", "pi_ff", "scheduled")
 PERIOD_S = PERIOD_NS * 1e-9

@@ -16,7 +16,7 @@ from dbc.record import Record
 from plant_sim.answer import answer_timer
 from plant_sim.drive import COUNTS_PER_RPM, Drive
 from plant_sim.equilibrium import initial_state
-from plant_sim.parameters import PlantParameters
+from plant_sim.parameters import MAX_LOAD_N, PlantParameters
 from plant_sim.period import (
     COLUMNS,
     LOAD,
@@ -34,7 +34,6 @@ _PRESSURE_PHASE = 4
 _COUNTS_PER_RAD_S = 30.0 * COUNTS_PER_RPM / math.pi
 _RESET_LSB_M = 1e-7
 _COUNTS_PER_UNIT = 1e6
-_MAX_LOAD_N = 1e6
 _FAULTS, _PARAMETERS = frozenset(BenchFault), frozenset(BenchParameter)
 _run_period, _answer_timer = entry_point(run_period), entry_point(answer_timer)
 
@@ -196,7 +195,7 @@ class Plant:
         for frame in self._bench_frames:
             if frame.can_id == load.can_id:
                 force_n = float(load.unpack(frame.data).force)
-                self._row[LOAD] = min(max(force_n, -_MAX_LOAD_N), _MAX_LOAD_N)
+                self._row[LOAD] = min(max(force_n, -MAX_LOAD_N), MAX_LOAD_N)
                 self.record.amend("load_n", self._row[LOAD])  # it acts in all of the period that now ends
                 continue
             asked = control.unpack(frame.data)

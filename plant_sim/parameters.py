@@ -12,6 +12,8 @@ import numpy as np
 from plant_sim import layout as at
 
 GRAVITY_M_S2 = 9.81
+MAX_LOAD_N = 1e6
+"""Largest load on the rod that may be asked for."""
 OVERTRAVEL_M = 0.02
 """The crane's triangle must close this far beyond either end stop."""
 

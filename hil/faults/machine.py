@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 from dbc.messages import BenchCommand, BenchFault, BenchParameter
 from dbc.node import PERIOD_NS, next_period
 from hil.faults.fault import Fault, FaultError, Stage, number, whole_ns
+from plant_sim.parameters import MAX_LOAD_N
 
-MAX_LOAD_N = 1e6
 _MICRO = 1e6
 
 
