@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.kernel import layout as k
+from firmware_py.kernel.fal import log2_q22
 
 MAGIC = b"DDHC"
 _HEADER = struct.Struct("<4sHHHH")
@@ -24,6 +25,7 @@ GAINS = (
     k.CAL_P_KP,
     k.CAL_PI_KP,
     k.CAL_PI_KI,
+    k.CAL_TD_K,
     k.CAL_TD_H,
     k.CAL_LEAD_V1,
     k.CAL_LEAD_V2,
@@ -59,25 +61,23 @@ GAINS = (
 )
 """Indices of the mantissas; the shift follows each."""
 
+ZONES = (k.CAL_ESO_DELTA, k.CAL_FB_DELTA1, k.CAL_FB_DELTA2, k.CAL_FB_DELTA3)
+"""Indices of fal's linear zones; the logarithm follows each."""
+
 VALUE_RANGES = {
     k.CAL_U_LIMIT: (1, INT32_MAX),
     k.CAL_LIMITER_RATE: (1, 2**24),
     k.CAL_LIMITER_SLEW: (1, 2**24),
     k.CAL_LIMITER_BRAKE: (1, 2**24),
-    k.CAL_TD_R: (1, INT32_MAX),
     k.CAL_TD_D: (1, 2**25),
-    k.CAL_ESO_DELTA: (1, INT32_MAX),
-    k.CAL_FB_DELTA1: (1, INT32_MAX),
-    k.CAL_FB_DELTA2: (1, INT32_MAX),
-    k.CAL_FB_DELTA3: (1, INT32_MAX),
     k.CAL_COMMAND_SLEW: (1, INT32_MAX),
     k.CAL_STROKE: (1, INT32_MAX),
     k.CAL_STIFFNESS_END_A: (1, INT32_MAX),
     k.CAL_STIFFNESS_END_B: (1, INT32_MAX),
     k.CAL_STIFFNESS_A: (1, INT32_MAX),
     k.CAL_STIFFNESS_B: (1, INT32_MAX),
-}
-"""Legal values of the words that are no gains; within them no 64-bit intermediate overflows."""
+} | dict.fromkeys(ZONES, (1, INT32_MAX))
+"""Legal values of the other words, logarithms left out; within them no 64-bit intermediate overflows."""
 
 WORD_NAMES = {
     value: name for name, value in vars(k).items() if name.startswith("CAL_") and name != "CAL_SIZE"
@@ -117,10 +117,14 @@ class Calibration:
         for index in GAINS:
             ranges[index] = (-INT32_MAX, INT32_MAX)
             ranges[index + 1] = (MIN_SHIFT, MAX_SHIFT)
+        for index in ZONES:
+            logarithm = log2_q22(max(1, self.words[index]))
+            ranges[index + 1] = (logarithm, logarithm)
         for index, word in enumerate(self.words):
             low, high = ranges[index]
             if not low <= word <= high:
-                name = WORD_NAMES.get(index) or WORD_NAMES[index - 1] + " shift"
+                second = " log2" if index - 1 in ZONES else " shift"
+                name = WORD_NAMES.get(index) or WORD_NAMES[index - 1] + second
                 raise CalibrationError(f"calibration: {name} = {word} outside {low}..{high}")
 
     def array(self) -> np.ndarray:

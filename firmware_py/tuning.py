@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from firmware_py.calibration import INT32_MAX, MAX_SHIFT, MIN_SHIFT, VALUE_RANGES, WORD_NAMES, Calibration
 from firmware_py.kernel import layout as k
+from firmware_py.kernel.fal import log2_q22
 
 PERIOD_S = 1e-3
 
@@ -191,6 +192,11 @@ def _value(index: int, physical: float, lsb: float) -> dict[int, int]:
     return {index: round(physical / lsb)}
 
 
+def _zone(index: int, physical: float, lsb: float) -> dict[int, int]:
+    half_width = _value(index, physical, lsb)
+    return half_width | {index + 1: log2_q22(half_width[index])}
+
+
 @dataclass(frozen=True, slots=True)
 class Tuning:
     """Everything a calibration block holds.
@@ -256,8 +262,8 @@ class Tuning:
 def _differentiator(adrc: AdrcTuning) -> dict[int, int]:
     periods = adrc.h0_s / PERIOD_S
     return (
-        _value(k.CAL_TD_R, adrc.r0_m_s2 * PERIOD_S**2, ACCELERATION_LSB)
-        | _value(k.CAL_TD_D, adrc.r0_m_s2 * adrc.h0_s**2, WORK_LSB)
+        _value(k.CAL_TD_D, adrc.r0_m_s2 * adrc.h0_s**2, WORK_LSB)
+        | _gain(k.CAL_TD_K, WORK_LSB / ACCELERATION_LSB / periods**2)
         | _gain(k.CAL_TD_H, periods * SPEED_LSB / WORK_LSB)
         | _gain(k.CAL_LEAD_V1, 2 * periods * SPEED_LSB / POSITION_LSB)
         | _gain(k.CAL_LEAD_V2, 2 * periods * ACCELERATION_LSB / SPEED_LSB)
@@ -267,7 +273,7 @@ def _differentiator(adrc: AdrcTuning) -> dict[int, int]:
 def _observer(adrc: AdrcTuning) -> dict[int, int]:
     w = adrc.omega_o_rad_s * PERIOD_S
     return (
-        _value(k.CAL_ESO_DELTA, adrc.eso_delta_m, POSITION_LSB)
+        _zone(k.CAL_ESO_DELTA, adrc.eso_delta_m, POSITION_LSB)
         | _gain(k.CAL_ESO_BETA1, 4 * w)
         | _gain(k.CAL_ESO_BETA2, 6 * w**2 * POSITION_LSB / SPEED_LSB)
         | _gain(k.CAL_ESO_BETA3, 4 * w**3 * POSITION_LSB / ACCELERATION_LSB)
@@ -287,9 +293,9 @@ def _feedback(adrc: AdrcTuning) -> dict[int, int]:
     speed = per_b0 * SPEED_LSB / PERIOD_S
     acceleration = per_b0 * ACCELERATION_LSB / PERIOD_S**2
     return (
-        _value(k.CAL_FB_DELTA1, adrc.delta1_m, POSITION_LSB)
-        | _value(k.CAL_FB_DELTA2, adrc.delta2_m_s * PERIOD_S, SPEED_LSB)
-        | _value(k.CAL_FB_DELTA3, adrc.delta3_m_s2 * PERIOD_S**2, ACCELERATION_LSB)
+        _zone(k.CAL_FB_DELTA1, adrc.delta1_m, POSITION_LSB)
+        | _zone(k.CAL_FB_DELTA2, adrc.delta2_m_s * PERIOD_S, SPEED_LSB)
+        | _zone(k.CAL_FB_DELTA3, adrc.delta3_m_s2 * PERIOD_S**2, ACCELERATION_LSB)
         | _gain(k.CAL_FB_K1, w**3 * position)
         | _gain(k.CAL_FB_K2, 3 * w**2 * speed)
         | _gain(k.CAL_FB_K3, 3 * w * acceleration)

@@ -509,36 +509,57 @@ static void store(int32_t *state, int32_t index, int64_t value)
  *
  * The normalised form is continuous with slope 1 in its linear zone. e and delta share one LSB, which is the
  * result's. Outside the zone it is delta 2^(alpha log2(|e| / delta)), both functions straight lines between
- * 128 points of an octave: the real power to 1e-5, rounded down; delta at delta, odd, monotonic because every
- * step is, never beyond |e|.
+ * 256 points of an octave: the real power to 3e-6, rounded down; delta at delta, odd, monotonic because every
+ * step is, never beyond |e|. zone is the calibration's index of delta, behind which its log2 stands.
  */
 
-static const int32_t DDH_LOG2[129] = {
-    0, 47091, 93817, 140186, 186202, 231871, 277198, 322188, 366846, 411176, 455185, 498875, 542252, 585321, 628085,
-    670549, 712717, 754593, 796182, 837487, 878511, 919259, 959735, 999942, 1039883, 1079563, 1118984, 1158150,
-    1197064, 1235729, 1274149, 1312326, 1350264, 1387966, 1425434, 1462672, 1499682, 1536467, 1573029, 1609372,
-    1645499, 1681410, 1717110, 1752600, 1787884, 1822963, 1857840, 1892517, 1926996, 1961280, 1995371, 2029270,
-    2062981, 2096506, 2129845, 2163002, 2195978, 2228775, 2261396, 2293842, 2326114, 2358216, 2390148, 2421912,
-    2453511, 2484945, 2516217, 2547328, 2578280, 2609074, 2639713, 2670197, 2700529, 2730709, 2760739, 2790621,
-    2820356, 2849946, 2879392, 2908695, 2937857, 2966879, 2995763, 3024509, 3053120, 3081595, 3109938, 3138148,
-    3166228, 3194177, 3221999, 3249692, 3277260, 3304703, 3332022, 3359218, 3386292, 3413246, 3440080, 3466796,
-    3493394, 3519876, 3546242, 3572494, 3598633, 3624659, 3650574, 3676379, 3702073, 3727659, 3753138, 3778509,
-    3803775, 3828935, 3853992, 3878945, 3903795, 3928544, 3953192, 3977740, 4002189, 4026540, 4050793, 4074949,
-    4099009, 4122974, 4146844, 4170621, 4194304
+static const int32_t DDH_LOG2[257] = {
+    0, 23591, 47091, 70499, 93817, 117046, 140186, 163238, 186202, 209080, 231871, 254577, 277198, 299735, 322188,
+    344558, 366846, 389052, 411176, 433220, 455185, 477069, 498875, 520603, 542252, 563825, 585321, 606741, 628085,
+    649354, 670549, 691670, 712717, 733691, 754593, 775423, 796182, 816869, 837487, 858034, 878511, 898920, 919259,
+    939531, 959735, 979872, 999942, 1019946, 1039883, 1059756, 1079563, 1099305, 1118984, 1138598, 1158150, 1177638,
+    1197064, 1216427, 1235729, 1254969, 1274149, 1293268, 1312326, 1331325, 1350264, 1369145, 1387966, 1406729,
+    1425434, 1444082, 1462672, 1481205, 1499682, 1518102, 1536467, 1554776, 1573029, 1591228, 1609372, 1627462,
+    1645499, 1663481, 1681410, 1699286, 1717110, 1734881, 1752600, 1770268, 1787884, 1805449, 1822963, 1840426,
+    1857840, 1875203, 1892517, 1909781, 1926996, 1944162, 1961280, 1978349, 1995371, 2012344, 2029270, 2046149,
+    2062981, 2079767, 2096506, 2113198, 2129845, 2146446, 2163002, 2179512, 2195978, 2212399, 2228775, 2245108,
+    2261396, 2277641, 2293842, 2309999, 2326114, 2342186, 2358216, 2374203, 2390148, 2406051, 2421912, 2437732,
+    2453511, 2469248, 2484945, 2500601, 2516217, 2531792, 2547328, 2562824, 2578280, 2593697, 2609074, 2624413,
+    2639713, 2654974, 2670197, 2685382, 2700529, 2715637, 2730709, 2745743, 2760739, 2775699, 2790621, 2805507,
+    2820356, 2835169, 2849946, 2864687, 2879392, 2894061, 2908695, 2923294, 2937857, 2952386, 2966879, 2981338,
+    2995763, 3010153, 3024509, 3038831, 3053120, 3067374, 3081595, 3095783, 3109938, 3124060, 3138148, 3152204,
+    3166228, 3180219, 3194177, 3208104, 3221999, 3235861, 3249692, 3263492, 3277260, 3290997, 3304703, 3318378,
+    3332022, 3345635, 3359218, 3372770, 3386292, 3399784, 3413246, 3426678, 3440080, 3453453, 3466796, 3480109,
+    3493394, 3506649, 3519876, 3533073, 3546242, 3559383, 3572494, 3585578, 3598633, 3611660, 3624659, 3637631,
+    3650574, 3663490, 3676379, 3689240, 3702073, 3714880, 3727659, 3740412, 3753138, 3765837, 3778509, 3791155,
+    3803775, 3816368, 3828935, 3841477, 3853992, 3866481, 3878945, 3891383, 3903795, 3916182, 3928544, 3940881,
+    3953192, 3965479, 3977740, 3989977, 4002189, 4014377, 4026540, 4038679, 4050793, 4062883, 4074949, 4086991,
+    4099009, 4111003, 4122974, 4134921, 4146844, 4158744, 4170621, 4182474, 4194304
 };
 
-static const int32_t DDH_EXP2[129] = {
-    4194304, 4217079, 4239977, 4263000, 4286147, 4309421, 4332820, 4356347, 4380002, 4403785, 4427697, 4451739,
-    4475911, 4500215, 4524651, 4549219, 4573921, 4598757, 4623728, 4648834, 4674077, 4699457, 4724974, 4750630,
-    4776426, 4802361, 4828438, 4854656, 4881016, 4907519, 4934167, 4960959, 4987896, 5014980, 5042211, 5069589,
-    5097117, 5124794, 5152621, 5180599, 5208729, 5237012, 5265449, 5294039, 5322786, 5351688, 5380747, 5409964,
-    5439339, 5468874, 5498570, 5528427, 5558445, 5588627, 5618973, 5649483, 5680159, 5711002, 5742012, 5773191,
-    5804539, 5836057, 5867746, 5899607, 5931642, 5963850, 5996233, 6028792, 6061528, 6094441, 6127533, 6160805,
-    6194258, 6227892, 6261709, 6295709, 6329894, 6364265, 6398822, 6433567, 6468501, 6503624, 6538938, 6574444,
-    6610143, 6646035, 6682122, 6718406, 6754886, 6791564, 6828442, 6865520, 6902799, 6940280, 6977965, 7015855,
-    7053950, 7092253, 7130763, 7169482, 7208412, 7247553, 7286906, 7326473, 7366255, 7406253, 7446469, 7486902,
-    7527555, 7568429, 7609525, 7650844, 7692387, 7734156, 7776152, 7818376, 7860829, 7903512, 7946428, 7989576,
-    8032959, 8076577, 8120432, 8164525, 8208857, 8253431, 8298246, 8343305, 8388608
+static const int32_t DDH_EXP2[257] = {
+    4194304, 4205676, 4217079, 4228512, 4239977, 4251473, 4263000, 4274558, 4286147, 4297768, 4309421, 4321105,
+    4332820, 4344568, 4356347, 4368158, 4380002, 4391877, 4403785, 4415725, 4427697, 4439701, 4451739, 4463809,
+    4475911, 4488047, 4500215, 4512416, 4524651, 4536918, 4549219, 4561553, 4573921, 4586322, 4598757, 4611225,
+    4623728, 4636264, 4648834, 4661438, 4674077, 4686749, 4699457, 4712198, 4724974, 4737785, 4750630, 4763511,
+    4776426, 4789376, 4802361, 4815382, 4828438, 4841529, 4854656, 4867818, 4881016, 4894250, 4907519, 4920825,
+    4934167, 4947544, 4960959, 4974409, 4987896, 5001420, 5014980, 5028577, 5042211, 5055882, 5069589, 5083335,
+    5097117, 5110937, 5124794, 5138688, 5152621, 5166591, 5180599, 5194645, 5208729, 5222851, 5237012, 5251211,
+    5265449, 5279725, 5294039, 5308393, 5322786, 5337217, 5351688, 5366198, 5380747, 5395336, 5409964, 5424632,
+    5439339, 5454087, 5468874, 5483702, 5498570, 5513478, 5528427, 5543416, 5558445, 5573516, 5588627, 5603779,
+    5618973, 5634207, 5649483, 5664801, 5680159, 5695560, 5711002, 5726486, 5742012, 5757581, 5773191, 5788844,
+    5804539, 5820276, 5836057, 5851880, 5867746, 5883655, 5899607, 5915603, 5931642, 5947724, 5963850, 5980019,
+    5996233, 6012490, 6028792, 6045138, 6061528, 6077962, 6094441, 6110965, 6127533, 6144147, 6160805, 6177509,
+    6194258, 6211052, 6227892, 6244778, 6261709, 6278686, 6295709, 6312779, 6329894, 6347056, 6364265, 6381520,
+    6398822, 6416171, 6433567, 6451011, 6468501, 6486039, 6503624, 6521257, 6538938, 6556667, 6574444, 6592269,
+    6610143, 6628065, 6646035, 6664054, 6682122, 6700240, 6718406, 6736621, 6754886, 6773200, 6791564, 6809978,
+    6828442, 6846956, 6865520, 6884134, 6902799, 6921514, 6940280, 6959097, 6977965, 6996885, 7015855, 7034877,
+    7053950, 7073076, 7092253, 7111482, 7130763, 7150096, 7169482, 7188921, 7208412, 7227956, 7247553, 7267203,
+    7286906, 7306663, 7326473, 7346338, 7366255, 7386227, 7406253, 7426334, 7446469, 7466658, 7486902, 7507201,
+    7527555, 7547965, 7568429, 7588949, 7609525, 7630157, 7650844, 7671588, 7692387, 7713244, 7734156, 7755126,
+    7776152, 7797235, 7818376, 7839574, 7860829, 7882142, 7903512, 7924941, 7946428, 7967973, 7989576, 8011238,
+    8032959, 8054738, 8076577, 8098475, 8120432, 8142448, 8164525, 8186661, 8208857, 8231114, 8253431, 8275808,
+    8298246, 8320745, 8343305, 8365926, 8388608
 };
 
 /* Compute log2 of value > 0, in 2^-22. */
@@ -546,9 +567,9 @@ static int32_t log2_q22(int32_t value)
 {
     int32_t zeros = clz((int64_t)(value & DDH_INT32_MAX)) - 32;
     int32_t mantissa = shl32(value, zeros - 1);
-    int32_t place = (mantissa >> 23) & 127;
+    int32_t place = (mantissa >> 22) & 255;
     int32_t left = DDH_LOG2[place];
-    int32_t rise = (int32_t)((int64_t)(DDH_LOG2[place + 1] - left) * (int64_t)((mantissa >> 8) & 0x7FFF)) >> 15;
+    int32_t rise = (int32_t)((int64_t)(DDH_LOG2[place + 1] - left) * (int64_t)((mantissa >> 8) & 0x3FFF)) >> 14;
     return (int32_t)(shl32(31 - zeros, 22) + left + rise);
 }
 
@@ -565,13 +586,13 @@ static int32_t magnitude_of(int32_t e)
 }
 
 /* Compute log2(|e| / delta) outside the linear zone, 0 in it, in 2^-22. */
-static int32_t octaves_beyond(int32_t e, int32_t delta)
+static int32_t octaves_beyond(const int32_t *calibration, int32_t zone, int32_t e)
 {
     int32_t magnitude = magnitude_of(e);
-    if (magnitude <= delta) {
+    if (magnitude <= calibration[zone]) {
         return 0;
     }
-    return (int32_t)(log2_q22(magnitude) - log2_q22(delta));
+    return (int32_t)(log2_q22(magnitude) - calibration[zone + 1]);
 }
 
 /* Compute sign(e) delta 2^octaves outside the linear zone, e in it.
@@ -584,10 +605,10 @@ static int32_t fal(int32_t e, int32_t delta, int32_t octaves)
     if (magnitude <= delta) {
         return e;
     }
-    int32_t place = (octaves >> 15) & 127;
+    int32_t place = (octaves >> 14) & 255;
     int32_t left = DDH_EXP2[place];
-    int32_t mantissa = left + ((int32_t)((int64_t)(DDH_EXP2[place + 1] - left) * (int64_t)(octaves & 0x7FFF)) >>
-            15);
+    int32_t mantissa = left + ((int32_t)((int64_t)(DDH_EXP2[place + 1] - left) * (int64_t)(octaves & 0x3FFF)) >>
+            14);
     int64_t power = ((int64_t)shl32(delta, octaves >> 22) * (int64_t)mantissa) >> 22;
     if (power < magnitude) {
         magnitude = (int32_t)power;
@@ -599,10 +620,10 @@ static int32_t fal(int32_t e, int32_t delta, int32_t octaves)
 }
 
 /* Normalised fal with alpha = 3/4. */
-static int32_t fal_3_4(int32_t e, int32_t delta)
+static int32_t fal_3_4(const int32_t *calibration, int32_t zone, int32_t e)
 {
-    int32_t octaves = octaves_beyond(e, delta);
-    return fal(e, delta, octaves - (octaves >> 2));
+    int32_t octaves = octaves_beyond(calibration, zone, e);
+    return fal(e, calibration[zone], octaves - (octaves >> 2));
 }
 
 /* eso: Extended state observer (eq. 26 with a linear zone): position, speed, acceleration, total disturbance. */
@@ -625,7 +646,7 @@ static void eso_step(const int32_t *calibration, int32_t *state, int32_t positio
     int64_t z4 = (int64_t)state[DDH_ST_Z4];
     int32_t delta = calibration[DDH_CAL_ESO_DELTA];
     int32_t e = sat32(z1 - (int64_t)position);
-    int32_t octaves = octaves_beyond(e, delta);
+    int32_t octaves = octaves_beyond(calibration, DDH_CAL_ESO_DELTA, e);
     int32_t fal_1_4 = fal(e, delta, octaves >> 2);
     int32_t fal_1_8 = fal(e, delta, octaves >> 3);
     store(state, DDH_ST_Z1, z1 + round_shift((int64_t)z2, 7) - gain(calibration, DDH_CAL_ESO_BETA1, e));
@@ -653,9 +674,9 @@ static int32_t nfcl(const int32_t *calibration, const int32_t *state)
             (int64_t)state[DDH_ST_Z1]);
     int32_t e2 = sat32((int64_t)v2 + gain(calibration, DDH_CAL_LEAD_V2, v3) - (int64_t)z2);
     int32_t e3 = sat32((int64_t)v3 - (int64_t)z3);
-    int64_t u0 = gain(calibration, DDH_CAL_FB_K1, fal_3_4(e1, calibration[DDH_CAL_FB_DELTA1])) + gain(calibration,
-            DDH_CAL_FB_K2, fal_3_4(e2, calibration[DDH_CAL_FB_DELTA2])) + gain(calibration, DDH_CAL_FB_K3,
-            fal_3_4(e3, calibration[DDH_CAL_FB_DELTA3]));
+    int64_t u0 = gain(calibration, DDH_CAL_FB_K1, fal_3_4(calibration, DDH_CAL_FB_DELTA1, e1)) + gain(calibration,
+            DDH_CAL_FB_K2, fal_3_4(calibration, DDH_CAL_FB_DELTA2, e2)) + gain(calibration, DDH_CAL_FB_K3,
+            fal_3_4(calibration, DDH_CAL_FB_DELTA3, e3));
     int64_t model = gain(calibration, DDH_CAL_FB_A1, z2) + gain(calibration, DDH_CAL_FB_A2, z3);
     return sat32(u0 - model - gain(calibration, DDH_CAL_FB_Z4, state[DDH_ST_Z4]));
 }
@@ -672,21 +693,14 @@ static void td_reset(int32_t *state, int32_t position)
     state[DDH_ST_V3] = 0;
 }
 
-/* Time-optimal acceleration (eq. 19).
+/* a of eq. 19, kept within +-d: by how much the motion misses the switching curve.
  *
  * Parameters
  * ----------
  * x1, a0, d : int64
  *     Position error, h0 x2 and r0 h0^2, 2^-34 m; 0 < d <= 2^25.
- * r : int64
- *     r0 T^2, 2^-40 m.
- *
- * Returns
- * -------
- * int64
- *     Acceleration times T^2, 2^-40 m.
  */
-static int64_t fhan(int64_t x1, int64_t a0, int64_t r, int64_t d)
+static int64_t switching_error(int64_t x1, int64_t a0, int64_t d)
 {
     int64_t y = clamp(x1 + a0, (int64_t)DDH_WORK_LIMIT);
     int64_t a = a0 + y;
@@ -698,19 +712,20 @@ static int64_t fhan(int64_t x1, int64_t a0, int64_t r, int64_t d)
         }
         a = a0 + half;
     }
-    if (d > 0) {
-        return -((r * clamp(a, d)) / d);
-    }
-    return (int64_t)0;
+    return clamp(a, d);
 }
 
-/* Advance v1, v2, v3 by one period towards setpoint (2^-31 m). */
+/* Advance v1, v2, v3 by one period towards setpoint (2^-31 m).
+ *
+ * fhan is -r0 a / d: the quotient r0 / d is 1 / h0^2.
+ */
 static void td_step(const int32_t *calibration, int32_t *state, int32_t setpoint)
 {
     int64_t v1 = (int64_t)state[DDH_ST_V1];
     int32_t v2 = state[DDH_ST_V2];
-    int64_t acceleration = fhan(shl64(v1 - (int64_t)setpoint, 3), gain(calibration, DDH_CAL_TD_H, v2),
-            (int64_t)calibration[DDH_CAL_TD_R], (int64_t)calibration[DDH_CAL_TD_D]);
+    int64_t error = shl64(v1 - (int64_t)setpoint, 3);
+    int64_t a = switching_error(error, gain(calibration, DDH_CAL_TD_H, v2), (int64_t)calibration[DDH_CAL_TD_D]);
+    int64_t acceleration = -gain(calibration, DDH_CAL_TD_K, (int32_t)a);
     store(state, DDH_ST_V1, v1 + round_shift((int64_t)v2, 7));
     store(state, DDH_ST_V2, (int64_t)v2 + round_shift(acceleration, 2));
     store(state, DDH_ST_V3, acceleration);

@@ -36,7 +36,7 @@ def eso_step(calibration: Array32, state: Array32, position: int32) -> None:
     z4 = i64(state[ST_Z4])
     delta = calibration[CAL_ESO_DELTA]
     e = sat32(z1 - i64(position))
-    octaves = octaves_beyond(e, delta)
+    octaves = octaves_beyond(calibration, CAL_ESO_DELTA, e)
     fal_1_4 = fal(e, delta, octaves >> 2)
     fal_1_8 = fal(e, delta, octaves >> 3)
     store(state, ST_Z1, z1 + round_shift(i64(z2), 7) - gain(calibration, CAL_ESO_BETA1, e))

@@ -2,10 +2,11 @@
 
 T is the control period, 1 ms. States are scaled by powers of T so that T never multiplies.
 A gain takes two words: mantissa at the index, shift at the next one; it stands for mantissa / 2**shift in
-the LSBs of its output over those of its input.
+the LSBs of its output over those of its input. So does a linear zone: its half width, and the log2 of that
+in 2^-22.
 """
 
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 
 # control laws
 LAW_P = 1
@@ -56,48 +57,48 @@ CAL_LIMITER_BRAKE = 3  # change of it the approach is planned with, 2^-31 m per 
 CAL_P_KP = 4  # gain: 2^-31 m -> 2^-20 rad/s
 CAL_PI_KP = 6  # gain: 2^-31 m -> 2^-20 rad/s
 CAL_PI_KI = 8  # gain, Ki T: 2^-31 m -> 2^-20 rad/s
-CAL_TD_R = 10  # r0 T^2, 2^-40 m
-CAL_TD_D = 11  # r0 h0^2, 2^-34 m
-CAL_TD_H = 12  # gain, h0 / T: 2^-38 m -> 2^-34 m
-CAL_LEAD_V1 = 14  # gain, 2 h0 / T: 2^-38 m -> 2^-31 m
-CAL_LEAD_V2 = 16  # gain, 2 h0 / T: 2^-40 m -> 2^-38 m
-CAL_ESO_DELTA = 18  # linear zone of the observer's fal, 2^-31 m
-CAL_ESO_BETA1 = 19  # gain, beta01 T: 2^-31 m -> 2^-31 m
-CAL_ESO_BETA2 = 21  # gain, beta02 T^2: 2^-31 m -> 2^-38 m
-CAL_ESO_BETA3 = 23  # gain, beta03 T^3: 2^-31 m -> 2^-40 m
-CAL_ESO_BETA4 = 25  # gain, beta04 T^4: 2^-31 m -> 2^-42 m
-CAL_ESO_A1 = 27  # gain, a1n T^2: 2^-38 m -> 2^-40 m
-CAL_ESO_A2 = 29  # gain, a2n T: 2^-40 m -> 2^-40 m
-CAL_ESO_B0 = 31  # gain, b0 T^3: 2^-20 rad/s -> 2^-40 m
-CAL_FB_DELTA1 = 33  # linear zones of the feedback's fal: 2^-31 m
-CAL_FB_DELTA2 = 34  # 2^-38 m
-CAL_FB_DELTA3 = 35  # 2^-40 m
-CAL_FB_K1 = 36  # gain, wc^3 / b0: 2^-31 m -> 2^-20 rad/s
-CAL_FB_K2 = 38  # gain, 3 wc^2 / (b0 T): 2^-38 m -> 2^-20 rad/s
-CAL_FB_K3 = 40  # gain, 3 wc / (b0 T^2): 2^-40 m -> 2^-20 rad/s
-CAL_FB_A1 = 42  # gain, a1n / (b0 T): 2^-38 m -> 2^-20 rad/s
-CAL_FB_A2 = 44  # gain, a2n / (b0 T^2): 2^-40 m -> 2^-20 rad/s
-CAL_FB_Z4 = 46  # gain, 1 / (b0 T^3): 2^-42 m -> 2^-20 rad/s
-CAL_FRONT_SMOOTH = 48  # gain, share of a period in v3's time constant: 2^-38 m -> 2^-40 m
-CAL_FRONT_LEAD = 50  # gain, lead time / T: 2^-40 m -> 2^-38 m
-CAL_FRONT_EXTEND = 52  # gain, speed per rod speed: 2^-38 m -> 2^-20 rad/s
-CAL_FRONT_RETRACT = 54  # gain, speed per rod speed: 2^-38 m -> 2^-20 rad/s
-CAL_COMMAND_SMOOTH = 56  # gain, share of a period in the filter's time constant: 2^-20 -> 2^-20 rad/s
-CAL_COMMAND_SLEW = 58  # largest change of the command, 2^-20 rad/s per T
-CAL_STROKE = 59  # L, 2^-31 m
-CAL_STIFFNESS_END_A = 60  # length of the dead volume behind the piston, 2^-31 m
-CAL_STIFFNESS_END_B = 61  # length of the dead volume on the rod's side, 2^-31 m
-CAL_STIFFNESS_A = 62  # column A's share of the stiffness times its length, 2^-31 m
-CAL_STIFFNESS_B = 63  # column B's share of the stiffness times its length, 2^-31 m
-CAL_SCHEDULED_BETA1 = 64  # gain, beta01 T: 2^-31 m -> 2^-31 m
-CAL_SCHEDULED_BETA2 = 66  # gain, beta02 T^2: 2^-31 m -> 2^-38 m
-CAL_SCHEDULED_BETA3 = 68  # gain, beta03 T^3: 2^-31 m -> 2^-40 m
-CAL_SCHEDULED_BETA4 = 70  # gain, part of beta04 T / b0 in proportion to a1n: 2^-31 m -> 2^-20 rad/s
-CAL_SCHEDULED_BETA4_SOFT = 72  # gain, the other part at stiffness 1: 2^-31 m -> 2^-20 rad/s
-CAL_SCHEDULED_B0 = 74  # gain, b0 T^3 at stiffness 1: 2^-20 rad/s -> 2^-40 m
-CAL_SCHEDULED_MOTOR = 76  # gain, share of a period in the motor's time constant: 2^-20 -> 2^-20 rad/s
-CAL_SCHEDULED_K1 = 78  # gain: 2^-31 m -> 2^-20 rad/s
-CAL_SCHEDULED_K2 = 80  # gain: 2^-38 m -> 2^-20 rad/s
-CAL_SCHEDULED_K3 = 82  # gain, constant part: 2^-40 m -> 2^-20 rad/s
-CAL_SCHEDULED_K3_SOFT = 84  # gain, part in proportion to 1 / stiffness: 2^-40 m -> 2^-20 rad/s
-CAL_SIZE = 86
+CAL_TD_D = 10  # r0 h0^2, 2^-34 m
+CAL_TD_K = 11  # gain, (T / h0)^2: 2^-34 m -> 2^-40 m
+CAL_TD_H = 13  # gain, h0 / T: 2^-38 m -> 2^-34 m
+CAL_LEAD_V1 = 15  # gain, 2 h0 / T: 2^-38 m -> 2^-31 m
+CAL_LEAD_V2 = 17  # gain, 2 h0 / T: 2^-40 m -> 2^-38 m
+CAL_ESO_DELTA = 19  # zone of the observer's fal, 2^-31 m
+CAL_ESO_BETA1 = 21  # gain, beta01 T: 2^-31 m -> 2^-31 m
+CAL_ESO_BETA2 = 23  # gain, beta02 T^2: 2^-31 m -> 2^-38 m
+CAL_ESO_BETA3 = 25  # gain, beta03 T^3: 2^-31 m -> 2^-40 m
+CAL_ESO_BETA4 = 27  # gain, beta04 T^4: 2^-31 m -> 2^-42 m
+CAL_ESO_A1 = 29  # gain, a1n T^2: 2^-38 m -> 2^-40 m
+CAL_ESO_A2 = 31  # gain, a2n T: 2^-40 m -> 2^-40 m
+CAL_ESO_B0 = 33  # gain, b0 T^3: 2^-20 rad/s -> 2^-40 m
+CAL_FB_DELTA1 = 35  # zones of the feedback's fal: 2^-31 m
+CAL_FB_DELTA2 = 37  # 2^-38 m
+CAL_FB_DELTA3 = 39  # 2^-40 m
+CAL_FB_K1 = 41  # gain, wc^3 / b0: 2^-31 m -> 2^-20 rad/s
+CAL_FB_K2 = 43  # gain, 3 wc^2 / (b0 T): 2^-38 m -> 2^-20 rad/s
+CAL_FB_K3 = 45  # gain, 3 wc / (b0 T^2): 2^-40 m -> 2^-20 rad/s
+CAL_FB_A1 = 47  # gain, a1n / (b0 T): 2^-38 m -> 2^-20 rad/s
+CAL_FB_A2 = 49  # gain, a2n / (b0 T^2): 2^-40 m -> 2^-20 rad/s
+CAL_FB_Z4 = 51  # gain, 1 / (b0 T^3): 2^-42 m -> 2^-20 rad/s
+CAL_FRONT_SMOOTH = 53  # gain, share of a period in v3's time constant: 2^-38 m -> 2^-40 m
+CAL_FRONT_LEAD = 55  # gain, lead time / T: 2^-40 m -> 2^-38 m
+CAL_FRONT_EXTEND = 57  # gain, speed per rod speed: 2^-38 m -> 2^-20 rad/s
+CAL_FRONT_RETRACT = 59  # gain, speed per rod speed: 2^-38 m -> 2^-20 rad/s
+CAL_COMMAND_SMOOTH = 61  # gain, share of a period in the filter's time constant: 2^-20 -> 2^-20 rad/s
+CAL_COMMAND_SLEW = 63  # largest change of the command, 2^-20 rad/s per T
+CAL_STROKE = 64  # L, 2^-31 m
+CAL_STIFFNESS_END_A = 65  # length of the dead volume behind the piston, 2^-31 m
+CAL_STIFFNESS_END_B = 66  # length of the dead volume on the rod's side, 2^-31 m
+CAL_STIFFNESS_A = 67  # column A's share of the stiffness times its length, 2^-31 m
+CAL_STIFFNESS_B = 68  # column B's share of the stiffness times its length, 2^-31 m
+CAL_SCHEDULED_BETA1 = 69  # gain, beta01 T: 2^-31 m -> 2^-31 m
+CAL_SCHEDULED_BETA2 = 71  # gain, beta02 T^2: 2^-31 m -> 2^-38 m
+CAL_SCHEDULED_BETA3 = 73  # gain, beta03 T^3: 2^-31 m -> 2^-40 m
+CAL_SCHEDULED_BETA4 = 75  # gain, part of beta04 T / b0 in proportion to a1n: 2^-31 m -> 2^-20 rad/s
+CAL_SCHEDULED_BETA4_SOFT = 77  # gain, the other part at stiffness 1: 2^-31 m -> 2^-20 rad/s
+CAL_SCHEDULED_B0 = 79  # gain, b0 T^3 at stiffness 1: 2^-20 rad/s -> 2^-40 m
+CAL_SCHEDULED_MOTOR = 81  # gain, share of a period in the motor's time constant: 2^-20 -> 2^-20 rad/s
+CAL_SCHEDULED_K1 = 83  # gain: 2^-31 m -> 2^-20 rad/s
+CAL_SCHEDULED_K2 = 85  # gain: 2^-38 m -> 2^-20 rad/s
+CAL_SCHEDULED_K3 = 87  # gain, constant part: 2^-40 m -> 2^-20 rad/s
+CAL_SCHEDULED_K3_SOFT = 89  # gain, part in proportion to 1 / stiffness: 2^-40 m -> 2^-20 rad/s
+CAL_SIZE = 91

@@ -38,9 +38,9 @@ def nfcl(calibration: Array32, state: Array32) -> int32:
     e2 = sat32(i64(v2) + gain(calibration, CAL_LEAD_V2, v3) - i64(z2))
     e3 = sat32(i64(v3) - i64(z3))
     u0 = (
-        gain(calibration, CAL_FB_K1, fal_3_4(e1, calibration[CAL_FB_DELTA1]))
-        + gain(calibration, CAL_FB_K2, fal_3_4(e2, calibration[CAL_FB_DELTA2]))
-        + gain(calibration, CAL_FB_K3, fal_3_4(e3, calibration[CAL_FB_DELTA3]))
+        gain(calibration, CAL_FB_K1, fal_3_4(calibration, CAL_FB_DELTA1, e1))
+        + gain(calibration, CAL_FB_K2, fal_3_4(calibration, CAL_FB_DELTA2, e2))
+        + gain(calibration, CAL_FB_K3, fal_3_4(calibration, CAL_FB_DELTA3, e3))
     )
     model = gain(calibration, CAL_FB_A1, z2) + gain(calibration, CAL_FB_A2, z3)
     return sat32(u0 - model - gain(calibration, CAL_FB_Z4, state[ST_Z4]))

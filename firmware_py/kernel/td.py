@@ -1,8 +1,8 @@
 """Tracking differentiator (eq. 18) on fhan (eq. 19)."""
 
-from dbc.machine import Array32, div, i64, int32, int64
+from dbc.machine import Array32, i32, i64, int32, int64
 from firmware_py.kernel.fixedpoint import absolute, clamp, gain, isqrt, round_shift, store
-from firmware_py.kernel.layout import CAL_TD_D, CAL_TD_H, CAL_TD_R, ST_V1, ST_V2, ST_V3
+from firmware_py.kernel.layout import CAL_TD_D, CAL_TD_H, CAL_TD_K, ST_V1, ST_V2, ST_V3
 
 WORK_LIMIT = 17179869184  # 1 m in 2^-34 m
 
@@ -14,20 +14,13 @@ def td_reset(state: Array32, position: int32) -> None:
     state[ST_V3] = 0
 
 
-def fhan(x1: int64, a0: int64, r: int64, d: int64) -> int64:
-    """Time-optimal acceleration (eq. 19).
+def switching_error(x1: int64, a0: int64, d: int64) -> int64:
+    """a of eq. 19, kept within +-`d`: by how much the motion misses the switching curve.
 
     Parameters
     ----------
     x1, a0, d : int64
         Position error, h0 x2 and r0 h0^2, 2^-34 m; 0 < d <= 2^25.
-    r : int64
-        r0 T^2, 2^-40 m.
-
-    Returns
-    -------
-    int64
-        Acceleration times T^2, 2^-40 m.
     """
     y = clamp(x1 + a0, i64(WORK_LIMIT))
     a = a0 + y
@@ -37,21 +30,19 @@ def fhan(x1: int64, a0: int64, r: int64, d: int64) -> int64:
         if y < 0:
             half = -half
         a = a0 + half
-    if d > 0:
-        return -div(r * clamp(a, d), d)
-    return i64(0)
+    return clamp(a, d)
 
 
 def td_step(calibration: Array32, state: Array32, setpoint: int32) -> None:
-    """Advance v1, v2, v3 by one period towards `setpoint` (2^-31 m)."""
+    """Advance v1, v2, v3 by one period towards `setpoint` (2^-31 m).
+
+    fhan is -r0 a / d: the quotient r0 / d is 1 / h0^2.
+    """
     v1 = i64(state[ST_V1])
     v2 = state[ST_V2]
-    acceleration = fhan(
-        (v1 - i64(setpoint)) << 3,
-        gain(calibration, CAL_TD_H, v2),
-        i64(calibration[CAL_TD_R]),
-        i64(calibration[CAL_TD_D]),
-    )
+    error = (v1 - i64(setpoint)) << 3
+    a = switching_error(error, gain(calibration, CAL_TD_H, v2), i64(calibration[CAL_TD_D]))
+    acceleration = -gain(calibration, CAL_TD_K, i32(a))
     store(state, ST_V1, v1 + round_shift(i64(v2), 7))
     store(state, ST_V2, i64(v2) + round_shift(acceleration, 2))
     store(state, ST_V3, acceleration)

@@ -6,9 +6,18 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from firmware_py.calibration import GAINS, INT32_MAX, MAX_SHIFT, MIN_SHIFT, VALUE_RANGES, Calibration
+from firmware_py.calibration import (
+    GAINS,
+    INT32_MAX,
+    MAX_SHIFT,
+    MIN_SHIFT,
+    VALUE_RANGES,
+    ZONES,
+    Calibration,
+)
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
+from firmware_py.kernel.fal import log2_q22
 from firmware_py.tuning import AdrcTuning, LimiterTuning, PiTuning, Tuning
 
 SEGMENT_STEPS = 100
@@ -65,6 +74,8 @@ def any_legal_calibration(rng):
         words[index + 1] = rng.integers(MIN_SHIFT, MAX_SHIFT, endpoint=True)
     for index, (low, high) in VALUE_RANGES.items():
         words[index] = max(low, high >> rng.integers(0, high.bit_length()))
+    for index in ZONES:
+        words[index + 1] = log2_q22(int(words[index]))
     return Calibration(k.LAW_ADRC, tuple(words.tolist()))
 
 

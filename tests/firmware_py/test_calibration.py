@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.calibration import GAINS, VALUE_RANGES, Calibration, CalibrationError
+from firmware_py.calibration import GAINS, VALUE_RANGES, ZONES, Calibration, CalibrationError
 from firmware_py.kernel import layout as k
 from firmware_py.tuning import Tuning
 
@@ -32,10 +32,10 @@ def test_round_trip():
         (b"", r"calibration: magic b'' instead of b'DDHC'"),
         (b"XXXX" + BLOCK[4:], r"calibration: magic b'XXXX' instead of b'DDHC'"),
         (BLOCK[:8], r"calibration: 8 bytes are too short for the header"),
-        (resealed(BLOCK[:4] + b"\x63\x00" + BLOCK[6:]), r"calibration: layout version 99 instead of 2"),
-        (BLOCK[:-1], r"calibration: 86 words in 359 bytes instead of 86 in 360"),
-        (BLOCK + b"\0", r"calibration: 86 words in 361 bytes instead of 86 in 360"),
-        (resealed(BLOCK[:8] + b"\x55" + BLOCK[9:]), r"calibration: 85 words in 360 bytes"),
+        (resealed(BLOCK[:4] + b"\x63\x00" + BLOCK[6:]), r"calibration: layout version 99 instead of 3"),
+        (BLOCK[:-1], r"calibration: 91 words in 379 bytes instead of 91 in 380"),
+        (BLOCK + b"\0", r"calibration: 91 words in 381 bytes instead of 91 in 380"),
+        (resealed(BLOCK[:8] + b"\x5a" + BLOCK[9:]), r"calibration: 90 words in 380 bytes"),
         (BLOCK[:-4] + b"\0\0\0\0", r"calibration: CRC 0x00000000 instead of 0x"),
         (resealed(BLOCK[:6] + b"\x09" + BLOCK[7:]), r"calibration: unknown control law 9"),
         (resealed(BLOCK[:12] + b"\0\0\0\0" + BLOCK[16:]), r"calibration: CAL_U_LIMIT = 0 outside 1\.\."),
@@ -63,6 +63,9 @@ def test_any_flipped_bit_is_noticed(bit):
         (k.CAL_FB_K1 + 1, 7, "CAL_FB_K1 shift = 7 outside 8..62"),
         (k.CAL_FB_K1 + 1, 63, "CAL_FB_K1 shift = 63 outside 8..62"),
         (k.CAL_FB_K1, -(2**31), "CAL_FB_K1 = -2147483648 outside -2147483647..2147483647"),
+        (k.CAL_ESO_DELTA, 0, "CAL_ESO_DELTA = 0 outside 1..2147483647"),
+        (k.CAL_ESO_DELTA, 2**17, r"CAL_ESO_DELTA log2 = \d+ outside 71303168..71303168"),
+        (k.CAL_FB_DELTA3 + 1, 0, r"CAL_FB_DELTA3 log2 = 0 outside \d+"),
         (k.CAL_LIMITER_BRAKE, 2**24 + 1, "CAL_LIMITER_BRAKE = 16777217 outside 1..16777216"),
     ],
 )
@@ -75,6 +78,6 @@ def test_an_illegal_word_is_refused(index, word, message):
 
 
 def test_every_word_has_a_legal_range():
-    gains = {index + offset for index in GAINS for offset in (0, 1)}
-    assert gains | VALUE_RANGES.keys() == set(range(k.CAL_SIZE))
-    assert gains.isdisjoint(VALUE_RANGES)
+    others = {index + offset for index in GAINS for offset in (0, 1)} | {index + 1 for index in ZONES}
+    assert others | VALUE_RANGES.keys() == set(range(k.CAL_SIZE))
+    assert others.isdisjoint(VALUE_RANGES)

@@ -96,7 +96,7 @@ def test_int32_stays_within_micrometres_of_floats(case):
     run = run_closed_loop(NOMINAL, CASES[case].setpoint, CASES[case].load_n)
     floats = step_through(CASES[case], lambda position_um: FloatAdrc(ADRC, position_um).step)
     difference_um = (run.position_m - floats) * 1e6
-    assert np.abs(difference_um).max() <= 2.5
+    assert np.abs(difference_um).max() <= 2.0
     assert np.sqrt(np.mean(difference_um**2)) <= 0.5
 
 

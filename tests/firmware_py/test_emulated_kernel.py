@@ -7,8 +7,10 @@ import pytest
 from emulated_kernel import EmulatedKernel
 from kernel_segments import Segment, run_compiled, segments
 
+from firmware_py.calibration import ZONES
 from firmware_py.emulated.processors import TARGETS
 from firmware_py.kernel import layout as k
+from firmware_py.kernel.fal import log2_q22
 from firmware_py.tuning import TUNINGS
 from hil.closed_loop import play_closed_loop
 from hil.references import setpoint_counts
@@ -69,8 +71,8 @@ def at_the_roots(delta):
 @pytest.mark.parametrize("delta", [1, 3, 214_748, 2**31 - 1])
 def test_where_square_roots_and_linear_zones_meet_their_ends(kernel, delta):
     words = list(TUNINGS["paper"].calibration().words)
-    for index in (k.CAL_ESO_DELTA, k.CAL_FB_DELTA1, k.CAL_FB_DELTA2, k.CAL_FB_DELTA3):
-        words[index] = delta
+    for index in ZONES:
+        words[index : index + 2] = delta, log2_q22(delta)
     calibration = type(TUNINGS["paper"].calibration())(k.LAW_ADRC, tuple(words))
     errors_um = sorted({e * 10**6 // 2**31 for e in at_the_roots(delta)})
     setpoints = np.array([sign * 10 * e % 2**31 for e in errors_um for sign in (1, -1)], np.int64)

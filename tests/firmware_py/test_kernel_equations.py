@@ -13,7 +13,7 @@ import pytest
 
 from dbc import machine
 from dbc.contract import Contract
-from firmware_py.calibration import GAINS
+from firmware_py.calibration import GAINS, ZONES
 from firmware_py.kernel import (
     adrc,
     command_filter,
@@ -65,8 +65,9 @@ class Case:
         for index in GAINS:
             self.words[index] = int(rng.integers(2**29, 2**31)) * int(rng.choice([-1, 1]))
             self.words[index + 1] = int(rng.integers(29, 33))
-        for index in (k.CAL_ESO_DELTA, k.CAL_FB_DELTA1, k.CAL_FB_DELTA2, k.CAL_FB_DELTA3):
+        for index in ZONES:
             self.words[index] = int(rng.integers(1000, 200_000))
+            self.words[index + 1] = log2(self.words[index])
         self.state = rng.integers(-(10**6), 10**6, k.ST_SIZE).tolist()
         self.state[k.ST_SATURATIONS] = 0
         self.position, self.setpoint = rng.integers(10**5, 10**6, 2).tolist()
@@ -92,9 +93,9 @@ class Case:
 
 
 def straight(function, x):
-    """The function in 2^-22, rounded at each 128th of its unit, straight between, rounded down."""
-    place, rest = divmod(x * 128, 1)
-    left, right = (round(2**22 * function((int(place) + n) / 128)) for n in (0, 1))
+    """The function in 2^-22, rounded at each 256th of its unit, straight between, rounded down."""
+    place, rest = divmod(x * 256, 1)
+    left, right = (round(2**22 * function((int(place) + n) / 256)) for n in (0, 1))
     return left + math.floor((right - left) * rest)
 
 
@@ -131,7 +132,7 @@ def test_the_calibrations_words_follow_each_other_two_to_a_gain():
     place = 0
     for name, index in names("CAL_").items():
         assert index == place, name
-        place += 2 if index in GAINS else 1
+        place += 2 if index in GAINS + ZONES else 1
     assert place - 1 == k.CAL_SIZE
 
 
@@ -152,7 +153,7 @@ def test_laws_have_the_numbers_of_the_bus():
 
 def test_another_layout_is_another_version():
     words = ",".join(f"{name}={index}" for name, index in names("CAL_").items())
-    assert (k.LAYOUT_VERSION, zlib.crc32(words.encode())) == (2, 2445913173)
+    assert (k.LAYOUT_VERSION, zlib.crc32(words.encode())) == (3, 1544597118)
 
 
 # arithmetic at its boundaries
@@ -220,8 +221,8 @@ def test_the_count_of_saturations_itself_saturates():
     assert state[k.ST_SATURATIONS] == HIGH
 
 
-def test_log2_at_each_128th_of_each_octave_and_beside_it():
-    knots = {mantissa << octave >> 7 for mantissa in range(128, 256) for octave in range(31)}
+def test_log2_at_each_256th_of_each_octave_and_beside_it():
+    knots = {mantissa << octave >> 8 for mantissa in range(256, 512) for octave in range(31)}
     for value in {near for knot in knots for near in (knot - 1, knot, knot + 1)} - {0}:
         assert powers.log2_q22(value) == log2(value), value
 
@@ -232,23 +233,29 @@ def test_magnitude_saturates():
 
 @pytest.mark.parametrize("delta", [1, 2, 3, 100, 214_748, 2**30 - 1, HIGH - 1, HIGH])
 def test_fal_is_the_identity_up_to_delta_and_a_power_beyond(delta):
+    zone = [delta, log2(delta)]
     rng = np.random.default_rng(delta)
     near = [*range(min(delta, HIGH - 200), min(delta + 200, HIGH)), *range(100), HIGH]
     for e in {*near, *rng.integers(0, HIGH, 200).tolist()}:
         for signed in (e, -e):
-            octaves = powers.octaves_beyond(signed, delta)
+            octaves = powers.octaves_beyond(zone, 0, signed)
             assert octaves == (log2(e) - log2(delta) if e > delta else 0)
             assert powers.fal(signed, delta, octaves >> 2) == fal(signed, delta, 0.25)
             assert powers.fal(signed, delta, octaves >> 3) == fal(signed, delta, 0.125)
-            assert powers.fal_3_4(signed, delta) == fal_3_4(signed, delta)
-    assert powers.fal_3_4(LOW, delta) == fal_3_4(LOW, delta)
+            assert powers.fal_3_4(zone, 0, signed) == fal_3_4(signed, delta)
+    assert powers.fal_3_4(zone, 0, LOW) == fal_3_4(LOW, delta)
 
 
 def test_fal_is_never_beyond_e():
     """Next to a delta of 31 bits the logarithm's LSB is 256 of fal's."""
     delta = 1_073_742_591
     for signed in (1, -1):
-        assert powers.fal_3_4(signed * (delta + 1), delta) == signed * (delta + 1)
+        assert powers.fal_3_4([delta, log2(delta)], 0, signed * (delta + 1)) == signed * (delta + 1)
+
+
+def test_a_zones_logarithm_stands_behind_it():
+    assert powers.octaves_beyond([7, 7, 16, 2 << 22, 7], 2, -64) == 4 << 22
+    assert powers.fal_3_4([7, 7, 16, 4 << 22, 7], 2, -16 * 16) == -16 * 8
 
 
 @pytest.mark.parametrize(
@@ -288,33 +295,27 @@ def test_factors_are_the_nearest_there_are(convert, factor):
 # the paper's ADRC
 
 
-def fhan(x1, a0, r, d):
-    """Eq. 19 in integers; the root is floored, the quotient truncated."""
+def switching_error(x1, a0, d):
+    """a of eq. 19 in integers, the root floored."""
     y = clip(x1 + a0, -(2**34), 2**34)
     a = a0 + y
     if abs(y) > d:
         a = a0 + int(math.copysign((math.isqrt(d * (d + 8 * abs(y))) - d) // 2, y))
-    return -truncated(Fraction(r * clip(a, -d, d), d))
+    return clip(a, -d, d)
 
 
 @pytest.mark.parametrize("d", [1, 2, 7, 1000, 10_737_418])
-@pytest.mark.parametrize("r", [1, 27_487_790])
-def test_fhan_is_eq_19(r, d):
+def test_the_switching_error_is_the_one_of_eq_19(d):
     for x1 in (0, 1, -1, 2, d - 1, d, d + 1, -d, -d - 1, 3 * d, 50 * d, 2**34, -(2**35), 2**36):
         for a0 in (0, 1, -1, d // 3, -d // 2, d, -2 * d, 2**33, -(2**34)):
-            assert td.fhan(x1, a0, r, d) == fhan(x1, a0, r, d)
+            assert td.switching_error(x1, a0, d) == switching_error(x1, a0, d)
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_beyond_a_metre_fhan_takes_the_error_for_one_metre(side):
-    d, r = 2**25, 27_487_790
+def test_beyond_a_metre_the_error_counts_as_one_metre(side):
+    d = 2**25
     a0 = -side * ((math.isqrt(d * (d + 8 * 2**34)) - d) // 2 + 1000)
-    assert td.fhan(side * 2**36, a0, r, d) == side * truncated(Fraction(r * 1000, d))
-
-
-@pytest.mark.parametrize("d", [0, -1])
-def test_fhan_without_a_divisor_commands_nothing(d):
-    assert td.fhan(1000, 7, 5, d) == 0
+    assert td.switching_error(side * 2**36, a0, d) == -side * 1000
 
 
 @CASES
@@ -322,7 +323,8 @@ def test_tracking_differentiator(seed):
     case = Case(seed)
     v1, v2 = case.before[k.ST_V1], case.before[k.ST_V2]
     error = (v1 - case.setpoint) * 2**3
-    a = fhan(error, case.gain(k.CAL_TD_H, v2), case.words[k.CAL_TD_R], case.words[k.CAL_TD_D])
+    missed = switching_error(error, case.gain(k.CAL_TD_H, v2), case.words[k.CAL_TD_D])
+    a = -case.gain(k.CAL_TD_K, missed)
     td.td_step(case.words, case.state, case.setpoint)
     case.assert_became(V1=v1 + to(v2, "v", "x"), V2=v2 + to(a, "a", "v"), V3=a)
 
