@@ -32,11 +32,3 @@ def clz(value: int64) -> int32:
 def div32(dividend: int32, divisor: int32) -> int32:
     """Quotient of `dividend` >= 0 and `divisor` > 0: one UDIV where there is one."""
     return dividend // divisor
-
-
-def div(dividend: int64, divisor: int64) -> int64:
-    """Quotient truncated towards zero, as in C; `divisor` must be positive where it is called."""
-    quotient = abs(dividend) // abs(divisor)
-    if (dividend < 0) != (divisor < 0):
-        quotient = -quotient
-    return quotient

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload, register_jitable
+from numba.extending import intrinsic, overload
 
 from dbc import machine
 
@@ -33,7 +33,6 @@ overload(machine.clz)(lambda value: lambda value: np.int32(_leading_zeros(np.int
 overload(machine.div32)(
     lambda dividend, divisor: lambda dividend, divisor: np.int32(np.uint32(dividend) // np.uint32(divisor))
 )
-register_jitable(machine.div)
 
 
 def register(module: ModuleType) -> None:

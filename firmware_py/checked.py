@@ -5,7 +5,6 @@ the flat int32 arrays. An overflow, an unnarrowed store or a zero divisor raises
 """
 
 import importlib.util
-import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -166,18 +165,6 @@ def div32(dividend: int, divisor: int) -> Int32:
     return i32(machine.div32(int(dividend), int(divisor)))
 
 
-def div(dividend: int, divisor: int) -> Int64:
-    """Quotient truncated towards zero, as in C.
-
-    Raises
-    ------
-    ZeroDivisionError, OverflowError
-        Where C leaves the result undefined.
-    """
-    quotient = operator.floordiv(abs(int(dividend)), abs(int(divisor)))
-    return i64(quotient if (dividend < 0) == (divisor < 0) else -quotient)
-
-
 class CheckedArray(list[int]):
     """Flat int32 array: loads give `Int32`, stores take what is already 32 bits wide.
 
@@ -222,7 +209,7 @@ def load() -> dict[str, ModuleType]:
             module.__dict__["__builtins__"] |= {"int": int, "memoryview": memoryview}
         exec(compile(Path(spec.origin).read_text(), spec.origin, "exec"), module.__dict__)
         if name == MACHINE:
-            module.__dict__.update(i32=i32, i64=i64, low32=low32, clz=clz, div32=div32, div=div)
+            module.__dict__.update(i32=i32, i64=i64, low32=low32, clz=clz, div32=div32)
         for table, value in list(module.__dict__.items()):
             if type(value) is tuple:
                 module.__dict__[table] = _checked_table(value)

@@ -271,7 +271,7 @@ def _is_docstring(node: ast.stmt) -> bool:
 
 
 class _FunctionChecker:
-    """Walks one function; `variables` holds the kinds of its names, `positive` the divisors known > 0.
+    """Walks one function; `variables` holds the kinds of its names.
 
     What it finds out of expressions and assigned names goes to `kinds`.
     """
@@ -288,7 +288,6 @@ class _FunctionChecker:
         self.functions = functions
         self.kinds = kinds
         self.variables: dict[str, Kind] = {}
-        self.positive: set[str] = set()
         self.result: Kind = None
 
     def violations(self, function: ast.FunctionDef) -> Iterator[str]:
@@ -340,7 +339,6 @@ class _FunctionChecker:
         if kind not in (known, "literal"):
             raise Violation(target, f"width of {target.id} changes from {known} to {kind}")
         self.kinds[target] = known
-        self.positive.discard(target.id)
 
     def _return(self, value: ast.expr) -> None:
         if self.result == 32:
@@ -351,15 +349,10 @@ class _FunctionChecker:
     def _branch(self, node: ast.If | ast.While) -> Iterator[str]:
         if self._kind(node.test) != "bool":
             raise Violation(node, "a condition is a comparison")
-        outside = set(self.positive)
-        self.positive |= _tested_positive(node.test)
         yield from self._block(node.body)
-        assigned = {child.id for child in ast.walk(node) if _is_target(child) and isinstance(child, ast.Name)}
-        self.positive = outside - assigned
         if isinstance(node, ast.While) and node.orelse:
             raise Violation(node, "not in the subset: else of a loop")
         yield from self._block(node.orelse)
-        self.positive -= assigned
 
     def _loop(self, node: ast.For) -> Iterator[str]:
         match node:
@@ -369,7 +362,6 @@ class _FunctionChecker:
                 if any(self._kind(bound) != "literal" for bound in bounds):
                     raise Violation(node, "the bounds of a for are constants")
                 self.kinds[node.target] = self.variables[name] = 32
-                self.positive = set()
                 yield from self._block(node.body)
             case _:
                 raise Violation(node, "not in the subset: a for that does not run over a constant range")
@@ -437,7 +429,7 @@ class _FunctionChecker:
 
     def _operation(self, node: ast.BinOp) -> Kind:
         if isinstance(node.op, ast.Div | ast.FloorDiv | ast.Mod):
-            raise Violation(node, f"division by an operator, use div: {ast.unparse(node)}")
+            raise Violation(node, f"division by an operator, use div32: {ast.unparse(node)}")
         if type(node.op) not in OPERATIONS:
             raise Violation(node, f"not in the subset: {type(node.op).__name__}")
         left, right = self._number(node.left), self._number(node.right)
@@ -463,29 +455,7 @@ class _FunctionChecker:
             fits = kind == expected or (kind == "literal" and expected in (32, 64))
             if not fits and not (name in ("i32", "i64") and kind in (32, 64)):
                 raise Violation(argument, f"{name} takes {expected}, not {kind}: {ast.unparse(argument)}")
-        if name == "div":
-            self._guarded(node.args[1])
         return signature.result
-
-    def _guarded(self, divisor: ast.expr) -> None:
-        constant = _constant(divisor, {})
-        is_tested = isinstance(divisor, ast.Name) and divisor.id in self.positive
-        if not is_tested and not (constant is not None and constant > 0):
-            raise Violation(divisor, f"unguarded divisor, test it > 0 around div: {ast.unparse(divisor)}")
-
-
-def _tested_positive(test: ast.expr) -> set[str]:
-    """Names that `test` shows to be > 0."""
-    match test:
-        case ast.Compare(left=ast.Name(id=name), ops=[ast.Gt()], comparators=[ast.Constant(value=0)]):
-            return {name}
-        case ast.BoolOp(op=ast.And(), values=values):
-            return {name for value in values for name in _tested_positive(value)}
-    return set()
-
-
-def _is_target(node: ast.AST) -> bool:
-    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
 
 
 def main() -> int:

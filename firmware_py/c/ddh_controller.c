@@ -386,7 +386,7 @@ static int32_t next_state(int32_t state, int32_t conditions)
     return state;
 }
 
-/* fixedpoint: Fixed-point arithmetic: one rounding rule (half up), saturation, and an exact integer square root. */
+/* fixedpoint: Fixed-point arithmetic: one rounding rule (half up), saturation, exact square root and quotient. */
 
 enum {
     DDH_INT32_MAX = 2147483647,
@@ -447,6 +447,39 @@ static int64_t gain(const int32_t *calibration, int32_t index, int32_t value)
 {
     int64_t product = (int64_t)value * (int64_t)calibration[index];
     return ((product >> (calibration[index + 1] - 1)) + 1) >> 1;
+}
+
+/* Floor of dividend / divisor, both >= 0, saturating; by zero it saturates.
+ *
+ * wide and rest are both times 2^n, wide within [2^30, 2^31). Two divisions by its upper 16 bits,
+ * rounded up, each leave less than two of their last places: 2^17 and 8 times wide.
+ */
+static int32_t quotient(int64_t dividend, int32_t divisor)
+{
+    if ((dividend >> 31) >= (int64_t)divisor) {
+        return DDH_INT32_MAX;
+    }
+    int32_t shift = clz((int64_t)divisor) - 33;
+    int32_t wide = shl32(divisor, shift);
+    int32_t head = (wide >> 15) + 1;
+    int64_t rest = shl64(dividend, shift);
+    int32_t result = shl32((int32_t)((uint32_t)(int32_t)(rest >> 31) / (uint32_t)head), 16);
+    rest = rest - ((int64_t)result * (int64_t)wide);
+    int32_t digit = shl32((int32_t)((uint32_t)(int32_t)(rest >> 17) / (uint32_t)head), 2);
+    result = result + digit;
+    rest = rest - ((int64_t)digit * (int64_t)wide);
+    if (rest >= shl64((int64_t)wide, 2)) {
+        result = result + 4;
+        rest = rest - shl64((int64_t)wide, 2);
+    }
+    if (rest >= shl64((int64_t)wide, 1)) {
+        result = result + 2;
+        rest = rest - shl64((int64_t)wide, 1);
+    }
+    if (rest >= (int64_t)wide) {
+        result = result + 1;
+    }
+    return (int32_t)result;
 }
 
 /* Floor of the square root of 0 < value < 2^61, in two halves (Zimmermann, "Karatsuba Square Root").
@@ -912,13 +945,10 @@ enum {
     DDH_RATIO_SHIFT = 24, /* LSB of the ratios: 2^-24 */
 };
 
-/* Stiffness (2^-24) of a column of length > 0 (2^-31 m): share (2^-31 m) / length. */
+/* Stiffness (2^-24) of a column: share / length, both 2^-31 m, of which at most 1 m counts. */
 static int64_t column(int32_t share, int64_t length)
 {
-    if (length > 0) {
-        return shl64((int64_t)share, DDH_RATIO_SHIFT) / length;
-    }
-    return (int64_t)0;
+    return (int64_t)quotient(shl64((int64_t)share, DDH_RATIO_SHIFT), sat32(length));
 }
 
 /* Stiffness (2^-24) at position (2^-31 m, kept within the stroke) over that at its reference. */
@@ -931,14 +961,10 @@ static int32_t stiffness(const int32_t *calibration, int32_t position)
     return sat32(column_a + column(calibration[DDH_CAL_STIFFNESS_B], length_b));
 }
 
-/* Reciprocal of a stiffness, both 2^-24. */
+/* Reciprocal of a stiffness >= 0, both 2^-24. */
 static int32_t softness(int32_t ratio)
 {
-    int64_t wide = (int64_t)ratio;
-    if (wide > 0) {
-        return sat32((int64_t)DDH_ONE / wide);
-    }
-    return 0;
+    return quotient((int64_t)DDH_ONE, ratio);
 }
 
 /* value times a stiffness or softness (2^-24). */

@@ -144,18 +144,15 @@ class ExpressionWriter:
             case "div32":
                 dividend, divisor = map(self._operand, node.args)
                 return f"(int32_t)((uint32_t){dividend} / (uint32_t){divisor})"
-            case "div":
-                return f"{self._operand(node.args[0])} / {self._operand(node.args[1])}"
         return f"{self._names.functions[name]}({', '.join(map(self.plain, node.args))})"
 
     def _operand(self, node: ast.expr) -> str:
         """Return an expression as an operand of another one."""
         text = self.plain(node)
-        is_division = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "div"
         is_shift = isinstance(node, ast.BinOp) and isinstance(node.op, ast.LShift)
         is_negative = text.startswith("-")
         is_operation = isinstance(node, ast.BinOp | ast.BoolOp | ast.Compare) and not is_shift
-        return f"({text})" if is_operation or is_division or is_negative else text
+        return f"({text})" if is_operation or is_negative else text
 
     def _left(self, node: ast.BinOp) -> str:
         """Return the left operand; a chain of sums needs no parentheses."""

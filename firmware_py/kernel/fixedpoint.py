@@ -1,4 +1,4 @@
-"""Fixed-point arithmetic: one rounding rule (half up), saturation, and an exact integer square root."""
+"""Fixed-point arithmetic: one rounding rule (half up), saturation, exact square root and quotient."""
 
 from dbc.machine import Array32, clz, div32, i32, i64, int32, int64, low32
 from firmware_py.kernel.layout import ST_SATURATIONS
@@ -50,6 +50,34 @@ def gain(calibration: Array32, index: int32, value: int32) -> int64:
     """
     product = i64(value) * i64(calibration[index])
     return ((product >> (calibration[index + 1] - 1)) + 1) >> 1
+
+
+def quotient(dividend: int64, divisor: int32) -> int32:
+    """Floor of `dividend` / `divisor`, both >= 0, saturating; by zero it saturates.
+
+    `wide` and `rest` are both times 2^n, `wide` within [2^30, 2^31). Two divisions by its upper 16 bits,
+    rounded up, each leave less than two of their last places: 2^17 and 8 times `wide`.
+    """
+    if dividend >> 31 >= i64(divisor):
+        return INT32_MAX
+    shift = clz(i64(divisor)) - 33
+    wide = divisor << shift
+    head = (wide >> 15) + 1
+    rest = dividend << shift
+    result = div32(i32(rest >> 31), head) << 16
+    rest = rest - i64(result) * i64(wide)
+    digit = div32(i32(rest >> 17), head) << 2
+    result = result + digit
+    rest = rest - i64(digit) * i64(wide)
+    if rest >= i64(wide) << 2:
+        result = result + 4
+        rest = rest - (i64(wide) << 2)
+    if rest >= i64(wide) << 1:
+        result = result + 2
+        rest = rest - (i64(wide) << 1)
+    if rest >= i64(wide):
+        result = result + 1
+    return i32(result)
 
 
 def isqrt(value: int64) -> int64:

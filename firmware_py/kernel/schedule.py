@@ -4,8 +4,8 @@ By eqs 20 to 22 both are proportional to A_A / V1(x) and A_B / V2(x), summed wit
 displacements (b0) as weights, 0.75 and 0.72: one ratio serves both.
 """
 
-from dbc.machine import Array32, div, i64, int32, int64
-from firmware_py.kernel.fixedpoint import clamp, mul_q, sat32
+from dbc.machine import Array32, i64, int32, int64
+from firmware_py.kernel.fixedpoint import clamp, mul_q, quotient, sat32
 from firmware_py.kernel.layout import (
     CAL_STIFFNESS_A,
     CAL_STIFFNESS_B,
@@ -19,10 +19,8 @@ RATIO_SHIFT = 24  # LSB of the ratios: 2^-24
 
 
 def column(share: int32, length: int64) -> int64:
-    """Stiffness (2^-24) of a column of `length` > 0 (2^-31 m): `share` (2^-31 m) / `length`."""
-    if length > 0:
-        return div(i64(share) << RATIO_SHIFT, length)
-    return i64(0)
+    """Stiffness (2^-24) of a column: `share` / `length`, both 2^-31 m, of which at most 1 m counts."""
+    return i64(quotient(i64(share) << RATIO_SHIFT, sat32(length)))
 
 
 def stiffness(calibration: Array32, position: int32) -> int32:
@@ -35,11 +33,8 @@ def stiffness(calibration: Array32, position: int32) -> int32:
 
 
 def softness(ratio: int32) -> int32:
-    """Reciprocal of a stiffness, both 2^-24."""
-    wide = i64(ratio)
-    if wide > 0:
-        return sat32(div(i64(ONE), wide))
-    return 0
+    """Reciprocal of a stiffness >= 0, both 2^-24."""
+    return quotient(i64(ONE), ratio)
 
 
 def scaled(value: int32, ratio: int32) -> int32:

@@ -9,7 +9,7 @@ from firmware_py.c_export.expressions import ExportError
 from firmware_py.c_export.program import Program
 from firmware_py.kernel_check import MACHINE, firmware_sources
 
-HEADER = "from dbc.machine import Array32, div, i32, i64, int32, int64\n"
+HEADER = "from dbc.machine import Array32, div32, i32, i64, int32, int64\n"
 
 
 def program_of(source: str) -> Program:
@@ -40,8 +40,7 @@ def statements_of(body: str, parameters: str = "a: int32, wide: int64, state: Ar
         ("x = i64(a) << 3", "int64_t x = shl64((int64_t)a, 3);"),
         ("x = a << 3 >> 1", "int32_t x = shl32(a, 3) >> 1;"),
         ("x = -(-a)", "int32_t x = -(-a);"),
-        ("x = div(-wide, 3)", "int64_t x = (-wide) / 3;"),
-        ("x = i64(a) * div(wide, 3)", "int64_t x = (int64_t)a * (wide / 3);"),
+        ("x = div32(a + 1, 3)", "int32_t x = (int32_t)((uint32_t)(a + 1) / (uint32_t)3);"),
         ("x = (a & 0x0F) ^ -0x10", "int32_t x = (a & 0x0F) ^ (-0x10);"),
         ("x = -2147483648", "int64_t x = -INT64_C(2147483648);"),
         ("x = 4294967296", "int64_t x = INT64_C(4294967296);"),

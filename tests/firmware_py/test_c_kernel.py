@@ -132,6 +132,11 @@ SHIFTS = [1, 2, 7, 8, 31, 32, 33, 61, 62]
 BRAKES = [1, 2, 3, 2**24]
 GAPS = [0, 1, -1, 2, -2, 3, -3, 2**24, 2**24 + 1, -(2**24) - 1, 2**32, -(2**32), 2**33, -(2**33)]
 POSITIVE = [1, 2, 3, 7, 2**24 - 1, 2**24, INT32_MAX, 2**32]
+DIVISORS = [0, 1, 2, 3, 7, 2**16 - 1, 2**16, 2**30 - 1, 2**30, 2**30 + 2**15 - 1, INT32_MAX]
+DIVIDENDS = [
+    0,
+    *(floor * divisor - 1 for floor in (1, 8, 2**16, INT32_MAX, 2**31) for divisor in DIVISORS[1:]),
+]
 HALF = [value for value in WIDE if abs(value) <= 2**62]
 
 VECTORS = {
@@ -147,8 +152,9 @@ VECTORS = {
     "fal": [[*NARROW, *DELTAS, *(-delta for delta in DELTAS)], DELTAS, [0, 1, 2**15 - 1, 2**15, 2**22 - 1]],
     "approach": [GAPS, BRAKES],
     "switching_error": [[*GAPS, 2**34, -(2**34)], GAPS[:9], [1, 2**24, 2**25]],
-    "column": [[1, 2, INT32_MAX], [0, -1, *POSITIVE]],
-    "softness": [NARROW],
+    "quotient": [[*DIVIDENDS, *(dividend + 1 for dividend in DIVIDENDS)], DIVISORS],
+    "column": [[1, 2, INT32_MAX], [0, *POSITIVE]],
+    "softness": [DIVISORS],
     "scaled": [NARROW, NARROW],
     "metres_from_setpoint": [NARROW],
     "metres_from_position": [NARROW],

@@ -42,8 +42,12 @@ def compiled_div32(dividend, divisor):
 
 
 @numba.njit
-def compiled_div(dividend, divisor):
-    return machine.div(dividend, divisor)
+def compiled_quotient(dividend, divisor):
+    return fixedpoint.quotient(np.int64(dividend), np.int32(divisor))
+
+
+def checked_quotient(dividend, divisor):
+    return int(FIXED.quotient(checked.i64(dividend), checked.i32(divisor)))
 
 
 @numba.njit
@@ -101,8 +105,8 @@ def narrow(function):
 
 FIXED = MODULES["fixedpoint"]
 ISQRT = pytest.mark.parametrize("isqrt", [wide(FIXED.isqrt), compiled_isqrt], ids=["checked", "compiled"])
-DIV = pytest.mark.parametrize(
-    "div", [wide(MODULES["machine"].div), compiled_div], ids=["checked", "compiled"]
+QUOTIENT = pytest.mark.parametrize(
+    "quotient", [checked_quotient, compiled_quotient], ids=["checked", "compiled"]
 )
 LOW32 = pytest.mark.parametrize(
     "low32",
@@ -195,14 +199,22 @@ def test_isqrt_of_every_head(low):
     assert first_wrong_head(low) == -1
 
 
-@DIV
-@given(dividend=INT64, divisor=st.integers(1, 2**63 - 1))
-@example(dividend=-7, divisor=2)
-@example(dividend=-(2**63) + 1, divisor=1)
-def test_div_truncates_towards_zero_as_c_does(div, dividend, divisor):
-    if dividend == -(2**63):
-        dividend += 1
-    assert div(dividend, divisor) == math.trunc(Fraction(dividend, divisor))
+@QUOTIENT
+@given(dividend=st.integers(0, 2**63 - 1), divisor=st.integers(0, 2**31 - 1))
+@example(dividend=2**62 - 1, divisor=2**31 - 1)
+@example(dividend=0, divisor=0)
+def test_quotient_is_the_floor_or_the_largest_number(quotient, dividend, divisor):
+    floor = dividend // divisor if divisor else 2**31 - 1
+    assert quotient(dividend, divisor) == min(floor, 2**31 - 1)
+
+
+@QUOTIENT
+@given(floor=st.integers(0, 2**31 - 1), divisor=POSITIVE32)
+@example(floor=2**31 - 1, divisor=2**31 - 1)
+@example(floor=2**31 - 1, divisor=2**30)
+def test_quotient_around_whole_ones(quotient, floor, divisor):
+    assert quotient(floor * divisor, divisor) == floor
+    assert quotient(floor * divisor + divisor - 1, divisor) == floor
 
 
 @LOW32

@@ -11,7 +11,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from dbc import machine
 from dbc.contract import Contract
 from firmware_py.calibration import GAINS, ZONES
 from firmware_py.kernel import (
@@ -50,10 +49,6 @@ def clip(value, low=LOW, high=HIGH):
 def to(value, lsb, new):
     """The same quantity in another LSB."""
     return half_up(Fraction(value) * Fraction(2) ** (LSB[lsb] - LSB[new]))
-
-
-def truncated(value):
-    return math.trunc(value)
 
 
 class Case:
@@ -181,12 +176,18 @@ def test_gain_takes_mantissa_and_the_shift_behind_it():
     assert fixedpoint.gain([9, 9, 3, 1, 9], 2, 5) == 8
 
 
-@pytest.mark.parametrize(
-    ("dividend", "divisor"),
-    [(7, 2), (-7, 2), (6, 3), (-6, 3), (0, 5), (1, 2), (-1, 2), (7, -2), (-7, -2), (7, -1)],
-)
-def test_div_truncates(dividend, divisor):
-    assert machine.div(dividend, divisor) == truncated(Fraction(dividend, divisor))
+def test_quotient_is_the_floor_and_saturates():
+    rng = np.random.default_rng(0)
+    divisors = [0, 1, 2, 3, 2**15, 2**16 - 1, 2**30 - 1, 2**30, 2**30 + 2**15 - 1, HIGH]
+    divisors += [int(rng.integers(2 ** (bits - 1), 2**bits)) for bits in range(1, 32) for _ in range(20)]
+    for divisor in divisors:
+        floors = [0, 1, 2, 3, 4, 5, 6, 7, 8, 2**16 - 1, 2**16, HIGH - 1, HIGH, HIGH + 1]
+        floors += [int(rng.integers(0, 2**bits)) for bits in range(1, 32)]
+        dividends = {floor * divisor + rest for floor in floors for rest in (-1, 0, 1, divisor - 1)}
+        for dividend in dividends | {2**63 - 1}:
+            if dividend >= 0:
+                expected = clip(dividend // divisor) if divisor else HIGH
+                assert fixedpoint.quotient(dividend, divisor) == expected, (dividend, divisor)
 
 
 def test_isqrt_is_the_floor_of_the_root():
@@ -471,7 +472,9 @@ def columns(words, position):
 
 
 def stiffness(words, position):
-    return clip(sum(truncated(Fraction(share * 2**24, length)) for share, length in columns(words, position)))
+    return clip(
+        sum(math.floor(Fraction(share * 2**24, length)) for share, length in columns(words, position))
+    )
 
 
 @pytest.mark.parametrize("position_mm", [-100, -1, 0, 1, 100, 200, 399, 400, 401, 900])
@@ -482,14 +485,21 @@ def test_stiffness_is_that_of_the_columns(position_mm):
     assert schedule.stiffness(words, position) == stiffness(words, position)
 
 
-@pytest.mark.parametrize(("length", "expected"), [(-1, 0), (0, 0), (1, 5 * 2**24), (2, 5 * 2**23)])
-def test_a_column_without_length_has_no_stiffness(length, expected):
+@pytest.mark.parametrize(
+    ("length", "expected"), [(0, HIGH), (1, 5 * 2**24), (2, 5 * 2**23), (HIGH, 0), (2**32, 0)]
+)
+def test_stiffness_of_a_column(length, expected):
     assert schedule.column(5, length) == expected
 
 
-@pytest.mark.parametrize("ratio", [-1, 0, 1, 2, 131_071, 131_072, 131_073, 2**24, 22_253_377, HIGH])
+def test_a_column_counts_with_at_most_a_metre():
+    assert schedule.column(HIGH, 2**31 - 2) == 2**24
+    assert schedule.column(HIGH, 2**32 - 1) == 2**24
+
+
+@pytest.mark.parametrize("ratio", [0, 1, 2, 131_071, 131_072, 131_073, 2**24, 22_253_377, HIGH])
 def test_softness_is_the_reciprocal(ratio):
-    assert schedule.softness(ratio) == (clip(2**48 // ratio) if ratio > 0 else 0)
+    assert schedule.softness(ratio) == (clip(2**48 // ratio) if ratio > 0 else HIGH)
 
 
 def scaled(value, ratio):
