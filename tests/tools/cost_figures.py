@@ -65,6 +65,7 @@ def compilers_table() -> str:
         "mean of the sine",
         "worst of the sine",
         "worst of jumps",
+        "cycles, worst of jumps",
         "flash, bytes",
     )
     lines = [
@@ -74,6 +75,7 @@ def compilers_table() -> str:
             f"{one['sine']['mean_instructions']:.0f}",
             str(one["sine"]["worst_instructions"]),
             str(one["jumps"]["worst_instructions"]),
+            "{}-{}".format(*one["jumps"]["worst_cycles"]),
             str(one["flash_bytes"]),
         )
         for compiler, built in figures()["compilers"].items()
