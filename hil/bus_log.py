@@ -1,11 +1,14 @@
 """Bus logs in the formats of the CAN world, read and written by python-can by the file's suffix."""
 
+import gzip
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import can
 import numpy as np
+from can.io.blf import FILE_HEADER_STRUCT
+from can.io.generic import TextIOMessageReader
 from can.io.logger import MESSAGE_WRITERS
 from can.io.player import MESSAGE_READERS
 
@@ -20,6 +23,9 @@ RESOLUTION_NS = 1000
 
 _NO_ROOM_FOR = {".trc": ERR_FLAG | FD_FLAG, ".csv": FD_FLAG, ".db": FD_FLAG}
 """Which frames python-can's writer of a format leaves out, or writes as what they are not."""
+
+_BLF_FILE_SIZE = 10
+"""Where in the header of a .blf."""
 
 _EVERY_CHANNEL = ""
 """Of error frames, as candump's reader does not tell theirs."""
@@ -38,10 +44,13 @@ class BusLog:
         have `ERR_FLAG`. Times count from where those of the log do; `.asc` begins at the first frame.
     left_out : Counter of str
         Remote and CAN FD frames, by kind: no node takes them.
+    damage : str
+        Why the log must have held more than what could be read; empty where nothing shows it.
     """
 
     traffic: np.ndarray
     left_out: Counter[str] = field(default_factory=Counter)
+    damage: str = ""
 
 
 def check_log_format(suffix: str) -> None:
@@ -83,7 +92,7 @@ def write_bus_log(path: Path, traffic: np.ndarray, payloads: np.ndarray | None =
 
 
 def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
-    """Read a log in the format of the file's suffix, which may be followed by ``.gz``.
+    """Read a log, as far as it is intact, in the format of its suffix, which may be followed by ``.gz``.
 
     Parameters
     ----------
@@ -104,6 +113,7 @@ def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
     _check_package(suffix)
     rows: list[tuple[str, float, int, int, int]] = []
     left_out: Counter[str] = Counter()
+    damage = ""
     try:
         with can.LogReader(path) as reader:
             for message in reader:
@@ -114,8 +124,13 @@ def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
     except OSError as error:
         raise BenchError(f"{path}: cannot be read ({error.strerror or error}): check the path") from error
     except Exception as error:  # whatever a reader makes of what is not its format
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise BenchError(f"{path}: not a {suffix} bus log ({reason})") from error
+        damage = " ".join(str(error).split()) or type(error).__name__
+        if not rows:
+            raise BenchError(f"{path}: not a {suffix} bus log, or a damaged one ({damage})") from error
+    else:
+        damage = _sign_of_a_cut(path, suffix)
+        if damage and issubclass(MESSAGE_READERS[suffix], TextIOMessageReader):
+            del rows[-1:]  # of the line that was cut
     names = {row[0] for row in rows} - {_EVERY_CHANNEL}
     if not names:
         raise BenchError(f"{path}: there is no data frame in it")
@@ -124,7 +139,32 @@ def read_bus_log(path: Path, channel: str | None = None) -> BusLog:
     if channel not in names:
         asked = "more than one channel is" if channel is None else f"no channel {channel!r} is"
         raise BenchError(f"{path}: {asked} in it: choose one of {', '.join(sorted(names))} by --channel")
-    return BusLog(_traffic([row[1:] for row in rows if row[0] in (channel, _EVERY_CHANNEL)]), left_out)
+    chosen = [row[1:] for row in rows if row[0] in (channel, _EVERY_CHANNEL)]
+    return BusLog(_traffic(chosen), left_out, damage)
+
+
+def holds_all_frames(path: Path) -> bool:
+    """Return whether the format of a log has room for every frame of a run."""
+    return _format_of(path) not in _NO_ROOM_FOR
+
+
+def _sign_of_a_cut(path: Path, suffix: str) -> str:
+    """Return what shows that a log that could be read was not written to its end; empty if nothing does."""
+    opened = gzip.open if path.suffix.lower() == ".gz" else open
+    with opened(path, "rb") as file:
+        content = file.read()
+    if suffix == ".blf":
+        size = FILE_HEADER_STRUCT.unpack_from(content)[_BLF_FILE_SIZE]
+        return "" if size == len(content) else f"{len(content)} bytes, {size} in its header"
+    if not issubclass(MESSAGE_READERS[suffix], TextIOMessageReader):
+        return ""
+    if not content.endswith(b"\n"):
+        return "its last line is not complete"
+    if suffix == ".asc":
+        content = content.lower()
+        if content.rfind(b"begin triggerblock") > content.rfind(b"end triggerblock"):
+            return "no End TriggerBlock"
+    return ""
 
 
 def _format_of(path: Path) -> str:

@@ -5,6 +5,8 @@ python-can imports asammdf wherever that is installed, which costs each process 
 
 import importlib
 import sys
+from contextlib import suppress
+from typing import Any
 
 if "can" not in sys.modules and "asammdf" not in sys.modules:
     sys.modules["asammdf"] = None  # type: ignore[assignment]  # makes its import fail
@@ -21,4 +23,13 @@ def load_mf4() -> bool:
     if mf4.asammdf is None:
         mf4 = importlib.reload(mf4)
         MESSAGE_WRITERS[".mf4"], MESSAGE_READERS[".mf4"] = mf4.MF4Writer, mf4.MF4Reader
-    return mf4.asammdf is not None
+    if mf4.asammdf is None:
+        return False
+    mf4.MDF4.__del__ = _close_what_was_opened  # type: ignore[method-assign]
+    return True
+
+
+def _close_what_was_opened(mdf: Any) -> None:
+    """Close a file that was refused without the traceback of what its reader had not come to."""
+    with suppress(AttributeError):
+        mdf.close()

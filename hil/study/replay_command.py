@@ -18,9 +18,10 @@ from hil.scenario import CONTROLLERS, law_of
 from hil.signals import decoded, signal_of
 
 if TYPE_CHECKING:
+    from hil.bus_log import BusLog
     from hil.study.replay import Difference, Replay
 
-EXIT_EQUAL, EXIT_DIFFERS = range(2)
+EXIT_EQUAL, EXIT_NOT_EQUAL = range(2)
 COUNTS = {
     "recorded": "in the log",
     "computed": "computed",
@@ -29,8 +30,8 @@ COUNTS = {
     "only_computed": "only computed",
     "only_recorded": "only in the log",
 }
-EXIT_CODES = """exit codes: 0 all that is in the log is computed again; 1 something differs;
-2 wrong input"""
+EXIT_CODES = """exit codes: 0 all that is in the log is computed again; 1 something differs, or the log
+ends early; 2 wrong input"""
 
 
 def add_command(commands: Any) -> None:
@@ -69,6 +70,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     law = None if arguments.controller is None else law_of(arguments.controller)
     with Console(stderr=True).status(f"reading {arguments.log}") as status:
         log = read_bus_log(arguments.log, arguments.channel)
+        damage = log.damage or _missing_of_run(arguments.log, log)
 
         def advance(share: float) -> None:
             status.update(f"replaying {arguments.log}: {share:.0%}")
@@ -83,6 +85,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         "controller": arguments.controller,
         "firmware": firmware.text,
         **figures_of(replayed, contract),
+        "log_end_s": int(log.traffic[-1, 0]) / 1e9,
+        "log_damage": damage,
         "passed_over": {"error": replayed.error_frames, **log.left_out},
     }
     files = [] if arguments.out is None else _write(arguments.out, result, replayed, contract)
@@ -94,7 +98,20 @@ def _replay(arguments: argparse.Namespace) -> int:
             print(f"{' and '.join(file.name for file in files)} in {arguments.out}")
     for line in _reservations(result):
         print(f"hil: {line}", file=sys.stderr)
-    return EXIT_DIFFERS if result["differences"] else EXIT_EQUAL
+    return EXIT_NOT_EQUAL if result["differences"] or damage else EXIT_EQUAL
+
+
+def _missing_of_run(path: Path, log: "BusLog") -> str:
+    """Return that a run counted more frames than its log holds, if its result lies beside the log."""
+    from hil.bus_log import holds_all_frames
+
+    frames = len(log.traffic) + log.left_out.total()
+    try:
+        counted = json.loads(path.with_name("result.json").read_text(encoding="utf-8"))["bus_frames"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    is_short = path.stem == "bus" and holds_all_frames(path) and frames < counted
+    return f"{frames} frames, {counted} in result.json" if is_short else ""
 
 
 def figures_of(replayed: "Replay", contract: Contract) -> dict[str, Any]:
@@ -152,7 +169,8 @@ def _print(result: dict[str, Any]) -> None:
         table.add_row(name, *(str(message[key]) for key in COUNTS))
     console, periods = Console(), result["periods"]
     console.print(table)
-    print(f"{periods['equal']} of {periods['compared']} control periods equal")
+    span = f"from {result['reset_s']:.6f} s to {result['log_end_s']:.6f} s"
+    print(f"{periods['equal']} of {periods['compared']} control periods equal, {span}")
     firsts = [message["first_difference"] for message in result["messages"].values()]
     for first in sorted(filter(None, firsts), key=lambda first: first["time_s"]):
         where = f"{first['time_s']:.6f} s ({first['since_reset_s']:.6f} s after the reset)"
@@ -180,6 +198,10 @@ def _cells(frame: dict[str, Any] | None) -> dict[str, str]:
 def _reservations(result: dict[str, Any]) -> list[str]:
     """Return what the reader has to know beside the figures, a line each."""
     lines = []
+    if damage := result["log_damage"]:
+        lines.append(
+            f"{result['log']} ends early or is damaged ({damage}): compared up to {result['log_end_s']:.6f} s"
+        )
     if result["timer"]["inferred"]:
         lines.append(
             "not on a simulated bus's time: the timer's phase is inferred from the commands, and what a "

@@ -1,5 +1,6 @@
 """Bus logs: the same frames whatever format they were written in and whatever they were converted to."""
 
+import gzip
 import subprocess
 import sys
 from collections import Counter
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from bench_runs import SAFETY_NET_S, hil
 from cantools.logreader import Parser
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from dbc.frame import EFF_FLAG, ERR_FLAG
@@ -166,6 +167,84 @@ def test_a_file_that_is_not_there(tmp_path, suffix):
 def test_an_unknown_suffix_names_the_known_ones(tmp_path, name):
     with pytest.raises(BenchError, match=r"choose one of \.asc, \.blf, .*\.mf4"):
         read_bus_log(tmp_path / name)
+
+
+# what was cut off
+
+
+@pytest.fixture(scope="module")
+def whole_logs(tmp_path_factory) -> tuple[np.ndarray, dict[str, bytes]]:
+    """Return frames, and a log of them in each format."""
+    folder = tmp_path_factory.mktemp("logs")
+    rng = np.random.default_rng(1)
+    traffic = np.array([(i * 1_000_000, 0x100, 8, int(rng.integers(2**63))) for i in range(300)], np.uint64)
+    contents = {}
+    for suffix in (*FORMATS, ".csv", ".trc"):
+        write_bus_log(folder / f"bus{suffix}", traffic)
+        contents[suffix] = (folder / f"bus{suffix}").read_bytes()
+        contents[f"{suffix}.gz"] = gzip.compress(contents[suffix])
+    return traffic, contents
+
+
+@pytest.mark.parametrize("packed", ["", ".gz"])
+@pytest.mark.parametrize("suffix", [*FORMATS, ".csv", ".trc"])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(share=st.floats(0, 1, exclude_max=True))
+def test_a_log_that_was_cut_off_is_refused_or_says_so_and_gives_the_intact_frames(
+    tmp_path, whole_logs, suffix, packed, share
+):
+    traffic, contents = whole_logs
+    content = contents[suffix + packed]
+    left = content[: int(share * len(content))]
+    has_no_mark_of_its_end = suffix in (".log", ".csv", ".trc") and not packed
+    assume(not (has_no_mark_of_its_end and left.endswith(b"\n")))
+    path = tmp_path / f"bus{suffix}{packed}"
+    path.write_bytes(left)
+    try:
+        log = read_bus_log(path)
+    except BenchError:
+        return
+    assert log.damage
+    assert "\n" not in log.damage
+    assert np.array_equal(log.traffic[:, 1:], traffic[: len(log.traffic), 1:])
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+def test_what_is_intact_of_a_log_that_was_cut_off_is_read(tmp_path, whole_logs, suffix):
+    traffic, contents = whole_logs
+    path = tmp_path / f"bus{suffix}"
+    path.write_bytes(contents[suffix][: len(contents[suffix]) // 2])
+    assert len(traffic) // 3 < len(read_bus_log(path).traffic) < len(traffic) * 2 // 3
+
+
+@pytest.mark.parametrize("suffix", [*FORMATS, ".csv", ".trc"])
+def test_a_whole_log_is_not_damaged(tmp_path, whole_logs, suffix):
+    path = tmp_path / f"bus{suffix}"
+    path.write_bytes(whole_logs[1][suffix])
+    assert read_bus_log(path).damage == ""
+
+
+def test_a_spoiled_line_ends_what_is_read(tmp_path, whole_logs):
+    traffic, contents = whole_logs
+    lines = contents[".log"].splitlines(keepends=True)
+    lines[100] = b"(0.1) can0 nonsense\n"
+    path = tmp_path / "bus.log"
+    path.write_bytes(b"".join(lines))
+    log = read_bus_log(path)
+    assert np.array_equal(log.traffic, traffic[:100])
+    assert log.damage
+
+
+def test_a_log_whose_writer_was_killed_is_damaged(tmp_path):
+    """python-can writes the size of a .blf into its header when it closes the file."""
+    path = tmp_path / "bus.blf"
+    message = can.Message(timestamp=0.0, arbitration_id=0x100, data=b"\1", is_extended_id=False)
+    writer = can.Logger(path, max_container_size=48)
+    writer.on_message_received(message)
+    writer.file.close()
+    log = read_bus_log(path)
+    assert log.traffic.tolist() == [[0, 0x100, 1, 1]]
+    assert log.damage == f"{path.stat().st_size} bytes, 144 in its header"
 
 
 # .mf4 on demand

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_runs import hil
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -342,6 +343,50 @@ def test_exit_code_1_comes_with_the_first_difference_in_signals(log, tmp_path, c
     said = capsys.readouterr().out
     assert f"first difference of DriveCommand: {time[1:-1]} s" in said
     assert f"TargetVelocity    {(velocity + 4) / 4:g} rpm" in said
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+def test_a_log_that_was_cut_off_is_compared_so_far_and_is_not_equal(tmp_path, capsys, suffix):
+    path = tmp_path / f"bus{suffix}"
+    write_bus_log(path, recorded())
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert cli.main(["replay", str(path), "--json"]) == 1
+    said = capsys.readouterr()
+    result = json.loads(said.out)
+    assert result["differences"] == 0
+    assert result["log_damage"]
+    assert 0.2 < result["log_end_s"] < 0.5
+    assert said.err == (
+        f"hil: {path} ends early or is damaged ({result['log_damage']}): "
+        f"compared up to {result['log_end_s']:.6f} s\n"
+    )
+
+
+def test_an_mf4_that_was_cut_off_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "bus.mf4"
+    write_bus_log(path, recorded())
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    refused = hil("replay", str(path))
+    (line,) = refused.stderr.splitlines()
+    assert refused.returncode == 2
+    assert line.startswith(f"hil: {path}: not a .mf4 bus log, or a damaged one")
+
+
+def test_a_log_cut_at_a_line_end_is_told_by_the_run_beside_it(tmp_path, capsys):
+    played = ("run", "sine", "--mode", "inprocess", "--duration", "0.1", "--out", str(tmp_path))
+    assert cli.main([*played]) == 0
+    path = tmp_path / "bus.log"
+    lines = path.read_text().splitlines(keepends=True)
+    assert cli.main(["replay", str(path)]) == 0
+    path.write_text("".join(lines[:400]))
+    capsys.readouterr()
+    assert cli.main(["replay", str(path)]) == 1
+    said = capsys.readouterr()
+    assert f"(400 frames, {len(lines)} in result.json)" in said.err
+    last_s = lines[399].split()[0].strip("()")
+    assert f"control periods equal, from 0.000000 s to {last_s} s" in said.out
+    other = path.rename(tmp_path / "another.log")
+    assert cli.main(["replay", str(other)]) == 0, "no log of that run"
 
 
 def test_another_firmware_is_compared_with_its_execution_time(tmp_path):
