@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -36,7 +37,15 @@ if TYPE_CHECKING:
     from plant_sim.machine import Machine
 
 MODES = ("inprocess", "lockstep", "realtime")
-BEGINNINGS = ("controller", "position_m", "bit_rate", "machine", "tuning")
+BEGINNINGS: dict[str, tuple[tuple[type, ...], str]] = {
+    "controller": ((str,), "the name of a control law"),
+    "position_m": ((int, float), "a number"),
+    "bit_rate": ((int, type(None)), "a whole number"),
+    "machine": ((Mapping,), "a table"),
+    "tuning": ((str, Path), "a name, or a Path to a file"),
+}
+"""What the marker `bench` takes: types, and the same in words."""
+OURS = ("dbc", "firmware_py", "hil", "plant_sim")
 STARTS = {"both": ("plant", "controller"), "none": (), "plant": ("plant",), "controller": ("controller",)}
 
 _VIRTUAL = frozenset({"virtual_time", "wire_faults", "power"})
@@ -154,6 +163,8 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Note the figures of the benches a test had; of a failing one leave the folder and say how to replay."""
     benches: list[Bench] = getattr(item, "funcargs", {}).get("_benches", [])
+    if call.excinfo and _has_bench(item) and not item.config.getoption("fulltrace"):
+        _end_traceback_at_test(call.excinfo)
     if call.when != "call" or not benches:
         return (yield)
     trouble = ""
@@ -172,6 +183,23 @@ def pytest_runtest_makereport(
             trouble += f"no results could be left ({error})"
         report.sections.append(("bench", f"{trouble}\nreplay: {_replay_command(item)}"))
     return report
+
+
+def _end_traceback_at_test(excinfo: pytest.ExceptionInfo[BaseException]) -> None:
+    """Leave of the traceback of what the bench refuses what comes before the bench: the line of the test."""
+    from hil.run.options import BenchError
+
+    if not isinstance(excinfo.value, AssertionError | BenchError | ValueError):
+        return
+    entry: TracebackType | None = excinfo.tb
+    last = excinfo.tb
+    while entry:
+        if entry.tb_frame.f_globals.get("__name__", "").partition(".")[0] not in OURS:
+            last = entry
+        entry = entry.tb_next
+    if last.tb_next:
+        last.tb_next = None
+        excinfo.value.__cause__ = None
 
 
 @pytest.fixture(scope="session")
@@ -213,11 +241,15 @@ def bench_at(hil_rig: "Callable[..., Rig]", _benches: "list[Bench]") -> "Iterato
     from hil.bench import Bench
 
     def bench_at(
-        machine: Mapping[str, Any] | None = None, tuning: str | Path | None = None, **how: Any
+        machine: Mapping[str, Any] | None = None,
+        tuning: str | Path | None = None,
+        controller: str = "",
+        position_m: float = 0.0,
+        bit_rate: int | None = None,
     ) -> "Bench":
         for earlier in _benches:
             earlier.end()
-        bench = Bench(hil_rig(machine, tuning), **how)
+        bench = Bench(hil_rig(machine, tuning), controller, position_m, bit_rate)
         _benches.append(bench)
         return bench
 
@@ -229,11 +261,29 @@ def bench_at(hil_rig: "Callable[..., Rig]", _benches: "list[Bench]") -> "Iterato
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, bench_at: "Callable[..., Bench]") -> "Bench":
     """Return a bench that is brought up and enabled; the marker `bench` says how it begins."""
+    from hil.run.options import BenchError
+
     marker = request.node.get_closest_marker("bench")
-    how = marker.kwargs if marker else {}
-    if unknown := [key for key in how if key not in BEGINNINGS]:
-        pytest.fail(f"a bench takes no {unknown[0]!r}: choose from {', '.join(BEGINNINGS)}", pytrace=False)
-    return bench_at(**how)
+    if refused := _wrong_beginning(marker) if marker else "":
+        pytest.fail(refused, pytrace=False)
+    try:
+        return bench_at(**(marker.kwargs if marker else {}))
+    except (BenchError, ValueError) as error:
+        refused = str(error)
+    pytest.fail(refused, pytrace=False)
+
+
+def _wrong_beginning(marker: pytest.Mark) -> str:
+    """Return what is wrong with a marker `bench`; empty if it can be had."""
+    if marker.args:
+        return f"a bench takes no {marker.args[0]!r}: say of what, e.g. controller={marker.args[0]!r}"
+    for key, value in marker.kwargs.items():
+        if key not in BEGINNINGS:
+            return f"a bench takes no {key!r}: choose from {', '.join(BEGINNINGS)}"
+        types, words = BEGINNINGS[key]
+        if not isinstance(value, types):
+            return f"{key} of a bench is {value!r}, must be {words}"
+    return ""
 
 
 def _new_rig(config: pytest.Config, directory: Path, machine: "Machine", tuning: "ChosenTuning") -> "Rig":

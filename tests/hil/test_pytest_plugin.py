@@ -81,6 +81,29 @@ def test_too_heavy(bench):
     pass
 """
 
+REFUSED = {  # by the bench, and what is said
+    'bench.inject("nonsense")': "there is no fault 'nonsense': choose one of drop, ",
+    'bench.inject("drop", mesage="DriveCommand")': "drop: there is no 'mesage', only at_s, message, count",
+    'bench.inject("sensor_bias", bias_m=9)': "sensor_bias: bias_m is 9, must be a number from -1 to 1 m",
+    'bench.power_off("gripper")': "power_off: node is 'gripper', must be one of controller, plant",
+    'bench.silence("Gripper")': "there is no message 'Gripper': choose one of DriveCommand, ",
+    "bench.run(-1)": "duration_s is -1, must be one period of 0.001 s or more",
+    'bench_at(tuning="none")': "there is no tuning 'none': choose one of paper, ",
+    "bench_at(positon_m=0.1)": "got an unexpected keyword argument 'positon_m'",
+}
+
+REFUSED_BEGINNINGS = {
+    'law="pi"': "a bench takes no 'law': choose from controller, position_m, bit_rate, machine, tuning",
+    '"pi"': "a bench takes no 'pi': say of what, e.g. controller='pi'",
+    'controller="pid"': "there is no controller 'pid': choose one of p, pi, adrc, pi_ff, scheduled",
+    "position_m=5": "position_m is 5, must be from 0 to 0.4 m",
+    'position_m="top"': "position_m of a bench is 'top', must be a number",
+    "bit_rate=0": "bit rate 0 is not from 10000 to 1000000 bit/s",
+    "machine=3": "machine of a bench is 3, must be a table",
+    'machine={"mass": 99}': "machine: mass is 99, must be a number from 0.1 to 10 times nominal",
+    'tuning="none"': "there is no tuning 'none': choose one of paper, robust, pi_star, pi_ff, linear",
+}
+
 LOSES_ITS_FIRMWARE = """
 import os, signal
 from pathlib import Path
@@ -252,14 +275,34 @@ def test_a_need_that_nothing_has_is_refused(tmp_path):
     assert f"ERROR: test_user.py::test_spoils_the_wire: nothing has 'wirefaults': {choose}" in refused.lines
 
 
-def test_a_beginning_that_a_bench_does_not_have_is_named(tmp_path):
-    mistyped = USER_TESTS.replace('controller="pi"', 'control="pi"')
-    session = user_session(tmp_path, mistyped, "--hil-mode=inprocess", "-k", "begins_as_marked")
-    assert (
-        "a bench takes no 'control': choose from controller, position_m, bit_rate, machine, tuning"
-        in session.said
-    )
-    assert "TypeError" not in session.said
+def test_what_the_bench_refuses_is_one_line_under_that_of_the_test(tmp_path):
+    tests = [f"def test_{number}(bench, bench_at):\n    {call}\n" for number, call in enumerate(REFUSED)]
+    session = user_session(tmp_path, "\n".join(tests), "--hil-mode=inprocess")
+    assert f"{len(REFUSED)} failed" in session.said
+    for call, said in REFUSED.items():
+        told = session.lines.index(f">       {call}")
+        following = [line for line in session.lines[told + 1 :] if line.startswith("E  ")]
+        assert said in following[0]
+    assert not re.search(r"hil/\S+\.py:\d", session.said), "a line of the bench's own files"
+
+
+def test_what_a_bench_cannot_begin_with_is_one_line(tmp_path):
+    tests = [
+        f"@pytest.mark.bench({marker})\ndef test_{number}(bench):\n    pass\n"
+        for number, marker in enumerate(REFUSED_BEGINNINGS)
+    ]
+    session = user_session(tmp_path, "import pytest\n\n" + "\n".join(tests), "--hil-mode=inprocess")
+    assert f"{len(REFUSED_BEGINNINGS)} errors" in session.said
+    titles = [n for n, line in enumerate(session.lines) if "ERROR at setup of test_" in line]
+    assert [session.lines[n + 1] for n in titles] == list(REFUSED_BEGINNINGS.values())
+    assert "def bench" not in session.said
+
+
+def test_a_mistake_of_the_test_itself_keeps_its_traceback(tmp_path):
+    tests = "def reach(table):\n    return table['no']\n\ndef test_own(bench):\n    reach({})\n"
+    session = user_session(tmp_path, tests, "--hil-mode=inprocess")
+    assert "    return table['no']" in session.said
+    assert "test_user.py:2: KeyError" in session.said
 
 
 @pytest.mark.parametrize("mode", ["inprocess", "lockstep"])
