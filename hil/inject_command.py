@@ -41,7 +41,9 @@ def add_command(commands: Any) -> None:
     inject.add_argument("channel", help=argparse.SUPPRESS)
     inject.add_argument("faults", nargs="+", help=argparse.SUPPRESS)
     inject.add_argument("-i", "--interface", default="hilbus", metavar="I", help="default hilbus")
-    inject.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s, for adapters that set it")
+    inject.add_argument(
+        "-b", "--bitrate", type=int, metavar="B", help="not on hilbus: bit/s, for adapters that set it"
+    )
     inject.add_argument(
         "--dbc", type=Path, metavar="FILE", help="not on hilbus: another DBC than the packaged ddh.dbc"
     )
@@ -73,6 +75,9 @@ def _tell(error: ValueError) -> None:
 def _inject(arguments: argparse.Namespace) -> int:
     faults = [fault_of_text(text) for text in arguments.faults]
     if arguments.interface == "hilbus":
+        for option, value in (("--dbc", arguments.dbc), ("--bitrate", arguments.bitrate)):
+            if value is not None:
+                raise BenchError(f"{option} {value}: on hilbus the bench that runs has its own: leave it out")
         for fault in faults:
             connection, answer = link.connect(arguments.channel, {"role": "fault", "fault": fault.table})
             connection.close()

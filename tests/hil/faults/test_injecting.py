@@ -304,6 +304,8 @@ def control_in(bus: can.BusABC) -> tuple[int, int, int]:
         (["nobody", "reset"], "no hub on hilbus channel 'nobody': start one"),
         (["test", "resets"], "there is no fault 'resets': choose one of drop"),
         (["a/b", "reset"], "channel name 'a/b'"),
+        (["test", "reset", "--dbc", "my.dbc"], "--dbc my.dbc: on hilbus the bench that runs has its own"),
+        (["test", "reset", "-b", "500000"], "--bitrate 500000: on hilbus the bench that runs has its own"),
     ],
 )
 def test_hil_inject_refuses_in_one_line(capsys, arguments, said):
