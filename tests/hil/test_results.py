@@ -3,11 +3,15 @@
 import csv
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_runs import hil, played
+from bench_runs import SAFETY_NET_S, hil, played
 
 from dbc.contract import Contract
 from dbc.frame import Frame
@@ -237,6 +241,20 @@ def test_limits_for_other_laws_than_the_one_played_are_mentioned(tmp_path, capsy
     assert cli.main(["run", str(scenario), "--mode", "inprocess", "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().err
     assert said == "hil: not judged: other has limits for pi, none for scheduled\n"
+
+
+def test_a_reader_that_has_enough_ends_it_quietly():
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as pipe:
+        ended = subprocess.run(
+            [sys.executable, "-m", "hil", "vcan", "status"],
+            stdout=pipe,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=SAFETY_NET_S,
+        )
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGPIPE, "")
 
 
 def test_without_limits_there_are_none_to_miss(tmp_path):
