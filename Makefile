@@ -42,7 +42,7 @@ figures: $(READY)  ## rewrite the figures in README from a new evaluation
 c: $(READY)  ## rewrite the exported C in firmware_py/c
 	$(BIN)/python -m firmware_py.c_export firmware_py/c
 
-elf: $(READY)  ## rebuild the Cortex-M images from firmware_py/c and firmware_py/target
+elf: $(READY)  ## rebuild the images of the processors from firmware_py/c and firmware_py/target
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[arm]'
 	$(BIN)/python -m firmware_py.emulated.build
 

@@ -81,7 +81,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--hil-start-timeout", type=float, default=120.0, metavar="S", help="default 120 s")
     group.addoption("--rt-ratio", default="1", metavar="R", help="realtime: 0.1 is ten times slower")
     group.addoption(
-        "--hil-firmware", default="python", metavar="NAME,K=V", help="python, cortex-m4,clock_mhz=168 ..."
+        "--hil-firmware",
+        default="python",
+        metavar="NAME,K=V",
+        help="as hil run: cortex-m4, rv32imc,clock_mhz=100 ...",
     )
     group.addoption("--hil-bitrate", type=int, metavar="B", help="bit/s (default 1000000)")
     group.addoption(

@@ -1,1 +1,1 @@
-"""The exported C on emulated Cortex-M processors: reference images, what runs them, what they cost."""
+"""The exported C on emulated processors: reference images, what runs them, what they cost."""

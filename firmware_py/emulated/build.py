@@ -30,22 +30,28 @@ SYMBOLS = (
     "timer_handler",
 )
 FLAGS = ("-std=c99", "-O2", "-g0", "-ffunction-sections", "-fdata-sections")
-LINK_FLAGS = ("-Wl,--gc-sections", "-Wl,--entry=reset_handler", "-Wl,-u,run_segment", "-Wl,-n")
+CALLED = ("timer_handler", "can_receive_handler", "run_segment")
+LINK_FLAGS = (
+    "-Wl,--gc-sections",
+    "-Wl,--entry=reset_handler",
+    *(f"-Wl,-u,{function}" for function in CALLED),
+    "-Wl,-n",
+)
 
 
 class BuildError(Exception):
     """The compiler is missing or refused; the message says what to do."""
 
 
-def compiler_version(compiler: str) -> str:
-    """Return a compiler's name and version.
+def compiler_version(compiler: str, processor: str) -> str:
+    """Return the name and version of a compiler for a processor.
 
     Raises
     ------
     BuildError
         If it is not installed.
     """
-    command = _command(compiler)
+    command = _command(compiler, processor)
     if compiler == "zig":
         return f"zig cc {_output([*command[:-1], 'version']).strip()}"
     return _output([*command, "--version"]).splitlines()[0]
@@ -56,8 +62,8 @@ def flags_of(compiler: str, processor: str, optimisation: str = "-O2") -> list[s
     target = TARGETS[processor]
     flags = [optimisation if flag == "-O2" else flag for flag in (*FLAGS, *LINK_FLAGS)]
     if compiler == "zig":
-        return ["-target", "thumb-freestanding-eabi", f"-mcpu={target.zig_cpu}", *flags]
-    return [f"-mcpu={target.gcc_cpu}", "-mthumb", "-ffreestanding", "-nostdlib", *flags]
+        return [*target.instructions.zig, target.zig, *flags]
+    return [*target.instructions.gcc[1:], target.gcc, "-ffreestanding", "-nostdlib", *flags]
 
 
 def build(compiler: str, processor: str, optimisation: str = "-O2", keep: Path | None = None) -> Image:
@@ -74,19 +80,19 @@ def build(compiler: str, processor: str, optimisation: str = "-O2", keep: Path |
     keep : Path, optional
         Where to leave the ELF file, without its symbols.
     """
-    sources = [*sorted(EXPORTED.glob("*.c")), TARGET / "startup.c", TARGET / "segment.c"]
-    if not TARGETS[processor].divides:
-        sources.append(TARGET / "divide.c")
+    target = TARGETS[processor]
+    names = ["startup.c", "segment.c", *target.instructions.sources, *target.sources]
     if compiler == "gcc":
-        sources.append(TARGET / "libc.c")
-    command = [*_command(compiler), *flags_of(compiler, processor, optimisation)]
+        names.append("libc.c")
+    sources = [*sorted(EXPORTED.glob("*.c")), *(TARGET / name for name in names)]
+    command = [*_command(compiler, processor), *flags_of(compiler, processor, optimisation)]
     command += [f"-I{EXPORTED}", f"-I{TARGET}", f"-Wl,-T,{TARGET / 'memory.ld'}", *map(str, sources)]
     last = ["-lgcc"] if compiler == "gcc" else []
     with tempfile.TemporaryDirectory() as directory:
         whole, stripped = Path(directory) / "whole.elf", Path(directory) / "stripped.elf"
         _output([*command, "-o", str(whole), *last])
         _output([*command, "-s", "-o", str(stripped), *last])
-        image = read_image(whole, _symbols(whole))
+        image = read_image(whole, _symbols(whole, target.instructions.code_bit))
         if read_image(stripped, image.symbols) != image:
             raise BuildError(f"{compiler}: stripping changed the program")
         if keep is not None:
@@ -94,18 +100,18 @@ def build(compiler: str, processor: str, optimisation: str = "-O2", keep: Path |
     return image
 
 
-def _symbols(path: Path) -> dict[str, int]:
+def _symbols(path: Path, code_bit: int) -> dict[str, int]:
     with path.open("rb") as file:
         table = ELFFile(file).get_section_by_name(".symtab")
         assert isinstance(table, SymbolTableSection)
         found = {symbol.name: symbol for symbol in table.iter_symbols()}
-        return {name: found[name]["st_value"] & ~1 for name in SYMBOLS}
+        return {name: found[name]["st_value"] & ~code_bit for name in SYMBOLS}
 
 
-def _command(compiler: str) -> list[str]:
+def _command(compiler: str, processor: str) -> list[str]:
     if compiler == "zig":
         return [sys.executable, "-m", "ziglang", "cc"]
-    return ["arm-none-eabi-gcc"]
+    return [TARGETS[processor].instructions.gcc[0]]
 
 
 def _output(command: list[str]) -> str:
@@ -137,7 +143,7 @@ def main(argv: list[str] | None = None) -> int:
                 "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
                 "symbols": dict(image.symbols),
             }
-        version = compiler_version(compiler)
+        version = compiler_version(compiler, next(iter(TARGETS)))
     except BuildError as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 2

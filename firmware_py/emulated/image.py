@@ -26,7 +26,7 @@ class Image:
     segments : tuple of (int, bytes)
         Load address and contents.
     symbols : mapping of str to int
-        Addresses; of functions without the Thumb bit.
+        Addresses; of functions without the bit that marks Thumb code.
     flash_bytes, ram_bytes : int
         Code, constants and initial values; variables, without the stack.
     """

@@ -1,34 +1,27 @@
-"""A Cortex-M in Unicorn: memory, calls, and what they cost.
+"""A processor in Unicorn: memory, calls, and what they cost.
 
-It has no NVIC and no SysTick: whoever uses it calls the handlers. The Unicorn engine is licensed under the
-GPL, version 2: it is an optional extra, and nothing of it is part of this package.
+It has no interrupt controller and no timer: whoever uses it calls the handlers. The Unicorn engine is
+licensed under the GPL, version 2: it is an optional extra, and nothing of it is part of this package.
 """
 
 from collections.abc import Iterable
+from importlib import import_module
 from struct import pack, unpack
 
-import unicorn.arm_const as arm
-from unicorn import UC_ARCH_ARM, UC_HOOK_BLOCK, UC_MODE_THUMB, UC_PROT_ALL, Uc, UcError
+import unicorn
+from unicorn import UC_HOOK_BLOCK, UC_PROT_ALL, Uc, UcError
 
 from firmware_py.emulated.cycles import Cost, cost_of
 from firmware_py.emulated.image import RAM, Image
+from firmware_py.emulated.processors import TARGETS, Target
 
-MODELS = {  # a Cortex-M0+ has the instructions of a Cortex-M0
-    "cortex-m0plus": arm.UC_CPU_ARM_CORTEX_M0,
-    "cortex-m3": arm.UC_CPU_ARM_CORTEX_M3,
-    "cortex-m4": arm.UC_CPU_ARM_CORTEX_M4,
-}
 FLASH = 0x08000000, 0x20000
 SCRATCH = 0x60000000, 0x400000
 """Memory that no real part has: for what tests exchange with the program."""
 PERIPHERALS = 0x40006000, 0x1000
 _RETURN = 0x0FFF_F000
 """Where calls return to; nothing else lies in its page."""
-
-_SMULL, _QADD, _NOP = b"\x82\xfb\x03\x01", b"\x82\xfa\x81\xf0", b"\x00\xbf\x00\xbf"
-_REFUSED = {"cortex-m0plus": (_SMULL, _QADD), "cortex-m3": (_QADD,), "cortex-m4": ()}
 _PAINT = 0xC5
-_ARGUMENTS = arm.UC_ARM_REG_R0, arm.UC_ARM_REG_R1, arm.UC_ARM_REG_R2, arm.UC_ARM_REG_R3
 
 
 class EmulationError(Exception):
@@ -41,7 +34,7 @@ class Machine:
     Parameters
     ----------
     processor : str
-        One of `MODELS`.
+        One of `TARGETS`.
     image : Image
         The program.
 
@@ -60,8 +53,15 @@ class Machine:
         self.image = image
         self.cost = Cost(0, 0, 0)
         self._processor = processor
-        _self_test(processor)
-        self._uc = _new_processor(processor)
+        target = TARGETS[processor]
+        _self_test(processor, target)
+        self._uc = _new_processor(target)
+        instructions = target.instructions
+        self._code_bit = instructions.code_bit
+        self._arguments = [_register(target, name) for name in instructions.arguments]
+        self._stack_pointer = _register(target, instructions.stack_pointer)
+        self._return_address = _register(target, instructions.return_address)
+        self._program_counter = _register(target, "PC")
         for begin, size in (FLASH, RAM, SCRATCH, PERIPHERALS, (_RETURN, 0x1000)):
             self._uc.mem_map(begin, size, UC_PROT_ALL)
         for address, contents in image.segments:
@@ -76,17 +76,17 @@ class Machine:
 
     def start(self) -> None:
         """Power-on: run from the reset handler until the program idles."""
-        self._uc.reg_write(arm.UC_ARM_REG_SP, self.image.symbols["stack_top"])
+        self._uc.reg_write(self._stack_pointer, self.image.symbols["stack_top"])
         self._run(self.image.symbols["reset_handler"], self.image.symbols["idle"])
 
     def call(self, function: str, *arguments: int) -> int:
         """Call a function by its symbol, as an interrupt would; return its result."""
-        for register, value in zip(_ARGUMENTS, arguments, strict=False):
+        for register, value in zip(self._arguments, arguments, strict=False):
             self._uc.reg_write(register, value)
-        self._uc.reg_write(arm.UC_ARM_REG_SP, self.image.symbols["stack_top"])
-        self._uc.reg_write(arm.UC_ARM_REG_LR, _RETURN | 1)
+        self._uc.reg_write(self._stack_pointer, self.image.symbols["stack_top"])
+        self._uc.reg_write(self._return_address, _RETURN | self._code_bit)
         self._run(self.image.symbols[function], _RETURN)
-        return int(self._uc.reg_read(arm.UC_ARM_REG_R0))
+        return int(self._uc.reg_read(self._arguments[0]))
 
     def write(self, address: int, contents: bytes) -> None:
         """Write memory."""
@@ -121,9 +121,9 @@ class Machine:
     def _run(self, begin: int, end: int) -> None:
         self._counted.clear()
         try:
-            self._uc.emu_start(begin | 1, end)
+            self._uc.emu_start(begin | self._code_bit, end)
         except UcError as error:
-            at = self._uc.reg_read(arm.UC_ARM_REG_PC)
+            at = self._uc.reg_read(self._program_counter)
             raise EmulationError(f"{self._processor}: {error} at {at:#010x}") from error
         self.cost = Cost(*map(sum, zip(*self._counted, strict=True))) if self._counted else Cost(0, 0, 0)
 
@@ -134,25 +134,36 @@ class Machine:
         self._counted.append(cost)
 
 
-def _new_processor(processor: str) -> Uc:
-    uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB)  # with UC_MODE_MCLASS it would be a Cortex-M33 whatever is asked for
-    uc.ctl_set_cpu_model(MODELS[processor])
+def _new_processor(target: Target) -> Uc:
+    instructions = target.instructions
+    uc = Uc(
+        getattr(unicorn, f"UC_ARCH_{instructions.architecture}"),
+        getattr(unicorn, f"UC_MODE_{instructions.mode}"),
+    )
+    uc.ctl_set_cpu_model(_constant(target, f"CPU_{target.model}"))
     return uc
 
 
-def _self_test(processor: str) -> None:
+def _register(target: Target, name: str) -> int:
+    return _constant(target, f"{target.instructions.architecture}_REG_{name}")
+
+
+def _constant(target: Target, name: str) -> int:
+    constants = import_module(f"unicorn.{target.instructions.architecture.lower()}_const")
+    return int(getattr(constants, f"UC_{name}"))
+
+
+def _self_test(processor: str, target: Target) -> None:
     """Make sure that the emulator is the processor asked for."""
-    for instruction in (_SMULL, _QADD, _NOP):
-        uc = _new_processor(processor)
+    for code in (*target.has, *target.lacks):
+        uc = _new_processor(target)
         uc.mem_map(FLASH[0], 0x1000, UC_PROT_ALL)
-        uc.mem_write(FLASH[0], instruction + _NOP)
+        uc.mem_write(FLASH[0], code)
         try:
-            uc.emu_start(FLASH[0] | 1, FLASH[0] + len(instruction))
+            uc.emu_start(FLASH[0] | target.instructions.code_bit, FLASH[0] + len(code))
             refused = False
         except UcError:
             refused = True
-        if refused != (instruction in _REFUSED[processor]):
+        if refused != (code in target.lacks):
             does = "refuses" if refused else "takes"
-            raise EmulationError(
-                f"the emulated {processor} {does} {instruction.hex()}: wrong Unicorn version?"
-            )
+            raise EmulationError(f"the emulated {processor} {does} {code.hex()}: wrong Unicorn version?")

@@ -76,7 +76,7 @@ class Meter:
 
     @property
     def stack_bytes(self) -> int:
-        """The stack that the handlers have used so far; an interrupt's own frame (32 bytes) comes on top."""
+        """The stack that the handlers have used so far; what an interrupt itself saves comes on top."""
         return self._machine.stack_bytes()
 
     def period(self, setpoint_0p1um: int, position_um: int) -> Metered:

@@ -19,7 +19,7 @@ from firmware_py.kernel import layout as k
 from firmware_py.node import Controller, execution_time
 
 CAN = 0x40006400
-_TO_SEND = CAN + 16
+TO_SEND = CAN + 16
 _STATE = at.MAILBOXES_SIZE + at.TASK_SIZE
 _IO = _STATE + k.ST_SIZE
 _CONTROLLER_WORDS = _IO + k.IO_SIZE
@@ -97,7 +97,7 @@ class EmulatedController(Controller):
         return answer_by_entry_points(self, packet, answer)
 
     def _sent_frames(self, send_ns: int) -> tuple[tuple[int, Frame], ...]:
-        words = self.machine.read_words(_TO_SEND, 1 + at.MAX_FRAMES * at.FRAME_SIZE)
+        words = self.machine.read_words(TO_SEND, 1 + at.MAX_FRAMES * at.FRAME_SIZE)
         count, *sent = (word & 0xFFFF_FFFF for word in words)
         messages = (sent[n * at.FRAME_SIZE : (n + 1) * at.FRAME_SIZE] for n in range(count))
         return tuple(

@@ -19,4 +19,8 @@ typedef struct can_registers {
 
 #define CAN ((volatile can_registers *)0x40006400u)
 
+void start_up(void);
+void timer_handler(void);
+void can_receive_handler(void);
+
 #endif

@@ -1,37 +1,14 @@
-/* Vector table, start-up and the two interrupt handlers: what a board support package has to provide. */
+/* Start-up and the two interrupt handlers: what a board support package has to provide, on any processor. */
 #include "board.h"
 
-extern uint32_t stack_top, data_begin, data_end, data_image, bss_begin, bss_end;
+extern uint32_t data_begin, data_end, data_image, bss_begin, bss_end;
 
-void reset_handler(void);
 __attribute__((noinline)) void idle(void);
-void timer_handler(void);
-void can_receive_handler(void);
 
 ddh_controller controller;
 
-/* Stands still: what a fault leads to. */
-static void halt(void)
-{
-    for (;;) {
-    }
-}
-
-typedef union vector {
-    void (*handler)(void);
-    const void *stack;
-} vector;
-
-__attribute__((section(".vectors"), used)) static const vector vectors[17] = {
-    [0] = {.stack = &stack_top},
-    [1] = {.handler = reset_handler},
-    [2] = {.handler = halt}, /* NMI */
-    [3] = {.handler = halt}, /* HardFault */
-    [15] = {.handler = timer_handler}, /* SysTick */
-    [16] = {.handler = can_receive_handler}, /* interrupt 0 */
-};
-
-void reset_handler(void)
+/* Called once there is a stack. */
+void start_up(void)
 {
     const uint32_t *image = &data_image;
     for (uint32_t *word = &data_begin; word < &data_end; word++) {

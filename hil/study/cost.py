@@ -1,5 +1,6 @@
 """What the firmware costs on its processors: instructions counted, cycles estimated, memory measured."""
 
+import itertools
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -146,19 +147,17 @@ def compilers_bill(periods: int, progress: Callable[[str], None]) -> dict[str, A
     """Return what ADRC costs as built by each compiler that is installed; see `bill` for the parameters."""
     sine, jumps = sine_inputs("ADRC", periods), jump_inputs()
     built: dict[str, Any] = {}
-    for compiler, optimisation in BUILDS:
+    for (compiler, optimisation), processor in itertools.product(BUILDS, TARGETS):
         try:
-            name = f"{compiler_version(compiler)} {optimisation}"
+            name = f"{compiler_version(compiler, processor)} {optimisation}"
         except BuildError as error:
-            progress(f"{compiler} left out: {error}")
+            progress(f"{processor}, {compiler} left out: {error}")
             continue
-        built[name] = {}
-        for processor in TARGETS:
-            progress(f"{processor}, {name}")
-            image = build(compiler, processor, optimisation)
-            built[name][processor] = {
-                "sine": summary(step_costs(processor, image, "ADRC", sine), sine),
-                "jumps": summary(step_costs(processor, image, "ADRC", jumps), jumps),
-                "flash_bytes": image.flash_bytes,
-            }
+        progress(f"{processor}, {name}")
+        image = build(compiler, processor, optimisation)
+        built.setdefault(name, {})[processor] = {
+            "sine": summary(step_costs(processor, image, "ADRC", sine), sine),
+            "jumps": summary(step_costs(processor, image, "ADRC", jumps), jumps),
+            "flash_bytes": image.flash_bytes,
+        }
     return built

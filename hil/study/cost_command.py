@@ -13,7 +13,8 @@ from firmware_py.chosen_firmware import COST, check_clock, require_emulator
 from hil.run.options import BenchError
 
 DESCRIPTION = """Instructions are counted in an emulator and exact. Cycles are an estimate from the reference
-manuals of Arm, a range, with zero wait states; worst is the worst seen, not a bound."""
+manuals (of rv32imc: for a Hazard3, the RISC-V core of the RP2350), a range, with zero wait states; worst is
+the worst seen, not a bound."""
 
 MOST_PERIODS = 10_000
 """Control periods of the sine."""
@@ -24,7 +25,7 @@ _WIDTH = 140
 def add_command(commands: Any) -> None:
     """Add ``cost`` to the command line."""
     parser = commands.add_parser(
-        "cost", help="what the firmware costs on a Cortex-M", description=DESCRIPTION
+        "cost", help="what the firmware costs on its processors", description=DESCRIPTION
     )
     parser.set_defaults(command=cost)
     parser.add_argument("--measure", action="store_true", help="measure instead of showing what was measured")
@@ -116,7 +117,7 @@ HEADINGS = (
 
 
 def _table(figures: dict[str, Any], clock_mhz: float | None) -> Table:
-    table = Table(title=f"{figures['compiler']}; cycles are an estimate")
+    table = Table(title=f"{figures['compiler']}; cycles are an estimate, of rv32imc for a Hazard3")
     bill = rows(figures, clock_mhz)
     for number, column in enumerate(zip(HEADINGS, *bill, strict=True)):
         longest = max(len(word) for text in column for word in text.split())  # a figure is never cut

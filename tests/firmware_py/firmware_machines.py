@@ -1,6 +1,6 @@
 """The whole firmware on each of its machines: events in, what each period sends and leaves behind out."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +13,9 @@ from firmware_py import checked, entry_points
 from firmware_py import task_layout as at
 from firmware_py.calibration import Calibration
 from firmware_py.contract_words import contract_words
+from firmware_py.emulated.image import reference_image
+from firmware_py.emulated.machine import Machine
+from firmware_py.emulated.node import CAN, TO_SEND
 from firmware_py.kernel import layout as k
 
 WORDS = at.MAILBOXES_SIZE + at.TASK_SIZE + k.ST_SIZE + k.IO_SIZE
@@ -54,6 +57,41 @@ def compiled_by_numba(
     return np.array(rows, np.int64)
 
 
+def emulated(processor: str, calibration: Calibration, events: Iterable[Event]) -> np.ndarray:
+    """Rows of the committed image of a processor."""
+    machine = Machine(processor, reference_image(processor))
+    symbols = machine.image.symbols
+    machine.write_words(symbols["ddh_calibration"], calibration.words)
+    machine.write_words(symbols["ddh_default_law"], [calibration.law])
+    rows = []
+    for kind, frame in events:
+        if kind == POWER_ON:
+            machine.start()
+        elif kind == FRAME:
+            machine.write_words(CAN, (frame.can_id, frame.dlc, frame.data, frame.data >> 32))
+            machine.call("can_receive_handler")
+        else:
+            machine.call("timer_handler")
+            count, *words = machine.read_words(TO_SEND, 1 + at.FRAMES_SIZE)
+            rows.append(
+                [
+                    count,
+                    *_sent(words[: count * at.FRAME_SIZE]),
+                    *machine.read_words(symbols["controller"], WORDS),
+                ]
+            )
+    return np.array(rows, np.int64)
+
+
+def _sent(words: Sequence[int]) -> list[int]:
+    """Identifier, length and data of each frame, and zeros up to the most that can be sent."""
+    sent = []
+    for first in range(0, len(words), at.FRAME_SIZE):
+        can_id, length, low, high = words[first : first + at.FRAME_SIZE]
+        sent += [can_id & 0xFFFFFFFF, length, int(high) << 32 | int(low) & 0xFFFFFFFF]
+    return sent + (3 * at.MAX_FRAMES - len(sent)) * [0]
+
+
 def interpreted(
     modules: dict[str, ModuleType], calibration: Calibration, events: Iterable[Event]
 ) -> np.ndarray:
@@ -76,10 +114,6 @@ def interpreted(
             task.receive(contract, mailboxes, words, *numbers)
         else:
             count = task.period(contract, mailboxes, words, flashed, state, io, frames)
-            sent = []
-            for first in range(0, count * at.FRAME_SIZE, at.FRAME_SIZE):
-                can_id, length, low, high = frames[first : first + at.FRAME_SIZE]
-                sent += [can_id & 0xFFFFFFFF, length, int(high) << 32 | int(low) & 0xFFFFFFFF]
-            sent += (3 * at.MAX_FRAMES - len(sent)) * [0]
+            sent = _sent(frames[: count * at.FRAME_SIZE])
             rows.append([count, *sent, *mailboxes, *words, *state, *io])
     return np.array([[int(word) for word in row] for row in rows], np.int64)

@@ -1,4 +1,4 @@
-"""What the firmware costs on a Cortex-M, in README and docs/silicon.md: from ``make cost``."""
+"""What the firmware costs on its processors, in README and docs/silicon.md: from ``make cost``."""
 
 import json
 import sys
@@ -10,6 +10,7 @@ from firmware_py.chosen_firmware import COST
 from hil.study.cost_command import HEADINGS, rows
 
 PAGE = ROOT / "docs" / "silicon.md"
+README_PROCESSORS = ("cortex-m0plus", "cortex-m4", "rv32imc")
 README_ROWS = ("P", "PI", "ADRC", "robust ADRC")
 
 
@@ -30,12 +31,8 @@ def whole_table() -> str:
 
 
 def readme_table() -> str:
-    """Return the bill of a Cortex-M4 and a Cortex-M0+ in short."""
-    shown = [
-        row
-        for row in rows(figures())
-        if row[0].startswith(("cortex-m4", "cortex-m0")) and row[1] in README_ROWS
-    ]
+    """Return the bill of `README_PROCESSORS` in short."""
+    shown = [row for row in rows(figures()) if row[0].startswith(README_PROCESSORS) and row[1] in README_ROWS]
     columns = (0, 1, 2, 6, 7, 9, 10)
     return _markdown(tuple(HEADINGS[n] for n in columns), [tuple(row[n] for n in columns) for row in shown])
 
