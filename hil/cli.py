@@ -4,9 +4,7 @@ import argparse
 import json
 import signal
 import sys
-from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from operator import attrgetter
@@ -15,7 +13,6 @@ from typing import Any
 
 import can
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from dbc.contract import ContractError
@@ -31,7 +28,9 @@ from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import DEFAULT_DATA_BIT_RATE, Wire
 from hil.faults.catalogue import fault_of_text, rows
 from hil.faults.fault import FaultError
-from hil.measure import result_of, trace_of
+from hil.measure import METRICS, result_of, trace_of
+from hil.picture import heading
+from hil.progress import progress_bar
 from hil.report import OutputDirectory
 from hil.run.arguments import ratio
 from hil.run.options import (
@@ -136,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default out/SCENARIO)")
     run.add_argument("--json", action="store_true", help="print result.json instead of a table")
     run.add_argument("--log", default=".log", metavar="SUFFIX", help="bus log: .log .asc .blf .mf4 ...")
-    run.add_argument("--duration", type=float, metavar="S", help="cut the scenario short, s")
+    run.add_argument("--duration", type=float, metavar="S", help="other length than the scenario's, s")
     run.add_argument("-b", "--bitrate", type=int, metavar="B", help="bit/s (default 1000000; -i: adapter's)")
     run.add_argument(
         "--data-bitrate",
@@ -231,10 +230,10 @@ def _run(arguments: argparse.Namespace) -> int:
         bus = bus_settings(*bus)
     interface, channel, bit_rate = bus
     stopped = StopFlag.on_signals()
-    console = Console(stderr=True)
     out = arguments.out or Path("out") / scenario.name
     with OutputDirectory(out, arguments.log) as folder:
-        with _progress(console, scenario.name, scenario.duration_s + BRING_UP_S) as progress:
+        length_s = scenario.duration_s + BRING_UP_S
+        with progress_bar(f"{scenario.name}: starting", length_s, "s") as show:
             options = RunOptions(
                 scenario=scenario,
                 controller=arguments.controller or "",
@@ -249,7 +248,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 rt_ratio=arguments.rt_ratio,
                 start_timeout_s=arguments.start_timeout,
                 answer_timeout_s=arguments.answer_timeout,
-                progress=progress,
+                progress=lambda simulated_s: show(completed=simulated_s, description=scenario.name),
                 stopped=stopped,
             )
             with RIGS[arguments.mode](options) as rig:
@@ -283,46 +282,25 @@ def _run(arguments: argparse.Namespace) -> int:
     return EXIT_LIMITS if result["within_limits"] is False else EXIT_OK
 
 
-@contextmanager
-def _progress(console: Console, name: str, duration_s: float) -> Iterator[Any]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[at]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"{name}: starting", total=duration_s, at="")
-
-        def advance(simulated_s: float) -> None:
-            bar.update(
-                task, completed=simulated_s, description=name, at=f"{simulated_s:.1f} of {duration_s:.1f} s"
-            )
-
-        yield advance
-
-
 def _table(result: dict[str, Any]) -> Table:
-    table = Table(
-        title=f"{result['scenario']}, {result['controller']} ({result['tuning']}), {result['mode']}"
-    )
+    table = Table(title=heading(result))
     table.add_column("")
     table.add_column("this run", justify="right")
     table.add_column("limit", justify="right")
     table.add_column("paper", justify="right")
     judged = (result["limits"], result["paper"]) if result["complete"] else (None, None)
-    for key, label in (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")):
+    for key in ("rms_mm", "max_mm"):
         limit, paper = ((source or {}).get(key) for source in judged)
-        table.add_row(label, *(_number(value, ".4f") for value in (result[key], limit, paper)))
+        table.add_row(METRICS[key][0], *(_number(value, ".4f") for value in (result[key], limit, paper)))
     latency = result["timing"]["latency_us"]
     rows = (
-        ("speed chatter / rpm per period", _number(result["chatter_rpm_per_period"], ".2f")),
+        (METRICS["chatter_rpm_per_period"][0], _number(result["chatter_rpm_per_period"], ".2f")),
         ("bus load / %", _number(result["bus_load_percent"], ".1f")),
         ("feedback to command, median / µs", _number(latency["p50"], ".0f")),
         ("feedback to command, maximum / µs", _number(latency["max"], ".0f")),
         ("missed periods", str(result["timing"]["missed_periods"])),
         ("late periods", str(result["timing"]["late_periods"])),
-        ("faults", str(len(result["faults"]))),
+        ("injected faults", str(len(result["faults"]))),
         ("start-up / s", _number(result["startup_s"], ".1f")),
         ("times real time", _number(result["realtime_factor"], ".1f")),
     )
@@ -384,8 +362,8 @@ def _list(arguments: argparse.Namespace) -> int:
 
 def _fault_table() -> Table:
     table = Table(box=None)
-    for heading in ("fault", "in real time", "parameters, in brackets the default of each"):
-        table.add_column(heading)
+    for column in ("fault", "in real time", "parameters, in brackets the default of each"):
+        table.add_column(column)
     for row in rows():
         what = f"{row.summary}\n{'; '.join(row.parameters).replace('`', '')}"
         table.add_row(row.kind, "yes" if row.real_time else "", what)

@@ -122,7 +122,7 @@ class ClosedLoopRun:
         return float(np.max(np.abs(self.error_m * 1e3)))
 
     @property
-    def chatter_rpm(self) -> float:
+    def chatter_rpm_per_period(self) -> float:
         """RMS of the first difference of the commanded speed, rpm per period."""
         return float(np.sqrt(np.mean(np.diff(self.command_rpm) ** 2)))
 

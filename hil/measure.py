@@ -61,6 +61,12 @@ BUS_COLUMNS = {  # of a side without a record: trace column, signal
     ),
 }
 
+METRICS = {  # key in result.json, sweep.json and tables.json: what it is, decimals
+    "rms_mm": ("RMS error / mm", 3),
+    "max_mm": ("maximum error / mm", 3),
+    "chatter_rpm_per_period": ("speed chatter / rpm per period", 2),
+}
+
 Trace = dict[str, np.ndarray]
 
 

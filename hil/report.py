@@ -12,10 +12,9 @@ import numpy as np
 from can.io.logger import MESSAGE_WRITERS
 
 from hil.bus_log import check_log_format, write_bus_log
-from hil.measure import M_TO_MM, Trace
+from hil.measure import Trace
+from hil.picture import draw
 from hil.run.options import BenchError, Recording
-
-BLUE, ORANGE, GREY, RED = "#0b5394", "#d9730d", "#8a8a8a", "#b02a30"
 
 
 class ResultFolder:
@@ -114,66 +113,3 @@ class OutputDirectory(ResultFolder):
             if old.suffix in MESSAGE_WRITERS:
                 old.unlink()
         return self.move_in(made)
-
-
-def _mark_faults(axes: Any, faults: list[dict[str, Any]]) -> None:
-    """Draw a line where a fault begins, with its kind at the top."""
-    for fault in faults:
-        for axis in axes:
-            axis.axvline(fault["at_s"], color=RED, lw=0.8, ls=":")
-        axes[0].annotate(
-            fault["kind"],
-            (fault["at_s"], 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(-2, -2),
-            textcoords="offset points",
-            rotation="vertical",
-            ha="right",
-            va="top",
-            fontsize="x-small",
-            color=RED,
-        )
-
-
-def draw(path: Path, result: dict[str, Any], trace: Trace) -> None:
-    """Draw position, tracking error and observed disturbance over time (the paper's Figure 5)."""
-    import matplotlib  # 0.3 s, which only drawing should cost
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    time_s = trace["time_s"]
-    figure, axes = pyplot.subplots(3, 1, figsize=(9, 8), sharex=True, layout="constrained")
-    position, error, disturbance = axes
-    paper = result["paper"]
-    beside = f"   (paper: {paper['rms_mm']:.3f} / {paper['max_mm']:.3f} mm)" if paper else ""
-    bit_rate = f"{result['bit_rate'] / 1e3:g} kbit/s"
-    title = f"{result['scenario']}, {result['controller'].upper()}, int32 over CAN at {bit_rate}"
-    if result["max_mm"] is not None:
-        title += f"\nRMS {result['rms_mm']:.3f} mm, maximum {result['max_mm']:.3f} mm{beside}"
-    figure.suptitle(title)
-
-    position.plot(time_s, trace["reference_m"] * M_TO_MM, color=GREY, lw=3, label="reference")
-    position.plot(time_s, trace["position_m"] * M_TO_MM, color=BLUE, lw=1.2, label="position")
-    position.set_ylabel("position / mm")
-    error.plot(time_s, trace["error_m"] * M_TO_MM, color=RED, lw=0.9, label="reference - position")
-    error.set_ylabel("error / mm")
-    if result["controller"] == "adrc" and "eso_disturbance_m_s3" in trace:
-        disturbance.plot(
-            time_s, trace["eso_disturbance_m_s3"], color=ORANGE, lw=0.9, label="observed by the ESO, z4"
-        )
-        disturbance.set_ylabel("total disturbance / (m/s³)")
-    elif "target_velocity_rpm" in trace:
-        disturbance.plot(
-            time_s, trace["target_velocity_rpm"], color=ORANGE, lw=0.9, label="commanded motor speed"
-        )
-        disturbance.set_ylabel("speed / rpm")
-    disturbance.set_xlabel("time / s")
-    for axis in axes:
-        axis.grid(alpha=0.3)
-        if axis.lines:
-            axis.legend(loc="best", fontsize="small")
-        axis.margins(x=0.01)
-    _mark_faults(axes, result["faults"])
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)

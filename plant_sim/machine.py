@@ -10,19 +10,19 @@ from plant_sim.parameters import NOMINAL, ParameterError, PlantParameters
 from plant_sim.sensors import PositionSensor
 
 
-def _factor(low: float, high: float) -> Any:
-    return field(default=1.0, metadata={"unit": "times nominal", "bounds": (low, high)})
+def _factor(called: str, low: float, high: float) -> Any:
+    return field(default=1.0, metadata={"called": called, "unit": "times nominal", "bounds": (low, high)})
 
 
-def _value(default: float, unit: str, low: float, high: float) -> Any:
-    return field(default=default, metadata={"unit": unit, "bounds": (low, high)})
+def _value(called: str, default: float, unit: str, low: float, high: float) -> Any:
+    return field(default=default, metadata={"called": called, "unit": unit, "bounds": (low, high)})
 
 
 @dataclass(frozen=True, slots=True)
 class Machine:
     """What varies from one machine to the next; the defaults are the nominal one.
 
-    Each field's metadata holds ``unit`` and closed ``bounds``.
+    Each field's metadata holds what it is ``called``, its ``unit`` and closed ``bounds``.
 
     Parameters
     ----------
@@ -43,14 +43,18 @@ class Machine:
         One line that names the key, its value and what is allowed.
     """
 
-    mass: float = _factor(0.1, 10.0)
-    bulk_modulus: float = _factor(0.05, 10.0)
-    leak: float = _factor(0.0, 100.0)
-    efficiency: float = _value(NOMINAL.volumetric_efficiency, "", 0.1, 1.0)
-    motor_time_constant_s: float = _value(NOMINAL.motor_time_constant_s, "s", 1e-4, 1.0)
-    motor_acceleration_rad_s2: float = _value(NOMINAL.motor_acceleration_rad_s2, "rad/s²", 1.0, 1e6)
-    position_lsb_um: int = _value(1, "µm", 1, 10_000)
-    delay_periods: int = _value(1, "periods", 1, MAX_DELAY_PERIODS)
+    mass: float = _factor("moving mass", 0.1, 10.0)
+    bulk_modulus: float = _factor("oil's bulk modulus", 0.05, 10.0)
+    leak: float = _factor("pumps' leak", 0.0, 100.0)
+    efficiency: float = _value("pumps' efficiency", NOMINAL.volumetric_efficiency, "", 0.1, 1.0)
+    motor_time_constant_s: float = _value(
+        "motor's time constant", NOMINAL.motor_time_constant_s, "s", 1e-4, 1.0
+    )
+    motor_acceleration_rad_s2: float = _value(
+        "motor's largest acceleration", NOMINAL.motor_acceleration_rad_s2, "rad/s²", 1.0, 1e6
+    )
+    position_lsb_um: int = _value("sensor's resolution", 1, "µm", 1, 10_000)
+    delay_periods: int = _value("drive's delay", 1, "periods", 1, MAX_DELAY_PERIODS)
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -98,6 +102,12 @@ class Machine:
     def text(self) -> str:
         """All keys in the form that `with_text` reads back without loss."""
         return ",".join(f"{key}={value!r}" for key, value in asdict(self).items())
+
+    @property
+    def changes(self) -> str:
+        """What differs from the nominal machine, for people to read; empty if nothing does."""
+        nominal = asdict(type(self)())
+        return ", ".join(f"{key}={value:g}" for key, value in asdict(self).items() if value != nominal[key])
 
     @property
     def parameters(self) -> PlantParameters:

@@ -33,6 +33,12 @@ class FaultError(ValueError):
         self.key = key
 
 
+def text_of(table: Mapping[str, Any]) -> str:
+    """Return a fault's `Fault.table` as a command line takes it."""
+    parameters = (f"{key}={value}" for key, value in table.items() if key != "kind")
+    return ",".join([table["kind"], *parameters])
+
+
 def number(low: float, high: float, unit: str, default: Any = MISSING) -> Any:
     """Return a field for a number within closed bounds, in a unit."""
     return field(default=default, metadata={"bounds": (low, high), "unit": unit})
@@ -133,8 +139,7 @@ class Fault:
     @property
     def text(self) -> str:
         """The fault as a command line takes it."""
-        kind, *parameters = self.table.items()
-        return ",".join([kind[1], *(f"{key}={value}" for key, value in parameters)])
+        return text_of(self.table)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 from dbc.contract import Contract
 from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.tuning import TUNINGS
-from hil.measure import Trace, left_run, result_of, trace_of
+from hil.measure import METRICS, Trace, left_run, result_of, trace_of
 from hil.run.inprocess import run_inprocess
 from hil.run.options import DEFAULT_BIT_RATE, Recording, RunOptions
 from hil.scenario import controller_of, law_of, load_scenario
@@ -22,11 +22,6 @@ from hil.study.stability import StabilityMap, map_machines, stability_maps
 from hil.study.state_space import Validation
 from hil.study.sweep import Sweep
 
-METRICS = {  # key in result.json and tables.json: what it is, decimals
-    "rms_mm": ("RMS error / mm", 3),
-    "max_mm": ("maximum error / mm", 3),
-    "chatter_rpm_per_period": ("speed chatter / rpm per period", 2),
-}
 _KEPT_COLUMNS = ("time_s", "reference_m", "position_m", "error_m", "load_n")
 OBSERVED, TRUE = "eso_disturbance_m_s3", "true_disturbance_m_s3"
 PAPER_TUNING = "paper"
@@ -240,7 +235,7 @@ def tables_of(evaluation: Evaluation) -> dict[str, Any]:
             "box": {key: list(ends) for key, ends in load_box().ranges.items()},
             "failed_above_mm": FAILED_RMS_MM,
             "contestants": {
-                label: {key: summary[key] for key in ("failures", "rms_mm", "chatter_rpm")}
+                label: {key: summary[key] for key in ("failures", "rms_mm", "chatter_rpm_per_period")}
                 for label, summary in evaluation.swept.items()
             },
         },

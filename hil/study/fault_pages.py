@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hil.report import BLUE, GREY, ORANGE
+from hil.picture import BLUE, GREY, ORANGE
 from hil.study.fault_matrix import PHASES, Detector, Reaction
 from hil.study.fault_runs import Played
 from hil.study.html_page import render

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
 from hil.faults.catalogue import KINDS
+from hil.progress import progress_bar
 from hil.report import ResultFolder
 from hil.run.options import BenchError, InterruptedRunError
 from hil.run.stopping import StopFlag
@@ -59,12 +59,12 @@ def run_command(arguments: argparse.Namespace) -> int:
         raise BenchError(f"--jobs is {arguments.jobs}, must be 1 or more")
     stopped = StopFlag.on_signals()
     with ResultFolder(arguments.out) as folder:
-        with all_cores(arguments.jobs) as executor, _progress(len(cases)) as bar:
+        with all_cores(arguments.jobs) as executor, progress_bar("faults", len(cases), "cases") as show:
 
             def advance(done: int) -> None:
                 if stopped.is_set():
                     raise InterruptedRunError(f"interrupted after {done} of {len(cases)} cases")
-                bar.update(bar.task_ids[0], completed=done)
+                show(completed=done)
 
             played = play_matrix(cases, tuning, executor, advance)
         matrix = matrix_of(played, tuning)
@@ -76,12 +76,13 @@ def run_command(arguments: argparse.Namespace) -> int:
             pictures["courses"] = folder.scratch / "courses.svg"
             draw(pictures["courses"], drawn)
         made[1].write_text(page(matrix, pictures), encoding="utf-8")
-        folder.move_in([*made, *pictures.values()])
+        made += pictures.values()
+        folder.move_in(made)
     if arguments.json:
         print(text)
     else:
         _print(matrix, played)
-        print(f"matrix.json, report.html in {arguments.out}")
+        print(f"{', '.join(file.name for file in made)} in {arguments.out}")
     return EXIT_UNEXPECTED if any(one.complaints for one in played) else EXIT_OK
 
 
@@ -99,14 +100,6 @@ def _cases(arguments: argparse.Namespace) -> list[Case]:
     if not cases:
         raise BenchError("the matrix has no such case")
     return cases
-
-
-def _progress(cases: int) -> Progress:
-    console = Console(stderr=True)
-    columns = TextColumn("faults"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    bar.add_task("faults", total=cases)
-    return bar
 
 
 def _print(matrix: dict[str, Any], played: "Sequence[Played]") -> None:

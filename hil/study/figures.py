@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from hil.measure import M_TO_MM, Trace
+from hil.measure import M_TO_MM, METRICS, Trace
 from hil.study.evaluation import OBSERVED, TRUE
 
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, PURPLE = (  # Okabe and Ito, told apart by the colour-blind
@@ -158,11 +158,7 @@ def comparison(tables: Mapping[str, Any]) -> Draw:
 
     def draw(figure: Figure) -> None:
         figure.set_size_inches(_WIDTH_IN, 0.9 + 0.9 * len(scenarios))
-        for axes, (metric, title) in zip(
-            figure.subplots(1, 2, sharey=True),
-            (("rms_mm", "RMS error / mm"), ("max_mm", "maximum error / mm")),
-            strict=True,
-        ):
+        for axes, metric in zip(figure.subplots(1, 2, sharey=True), ("rms_mm", "max_mm"), strict=True):
             for row, (label, one) in enumerate(contestants.items()):
                 offset = (row - (len(contestants) - 1) / 2) * 0.8 / len(contestants)
                 y = np.arange(len(scenarios)) + offset
@@ -174,7 +170,7 @@ def comparison(tables: Mapping[str, Any]) -> Draw:
             axes.plot([], [], "D", color=BLACK, mfc="none", ms=5, label="paper")
             axes.set_xscale("log")
             axes.margins(x=0.05)
-            axes.set_xlabel(title)
+            axes.set_xlabel(METRICS[metric][0])
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter(NullFormatter())

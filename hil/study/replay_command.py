@@ -12,7 +12,8 @@ from rich.table import Table
 from dbc.contract import Contract
 from firmware_py.chosen_firmware import add_firmware_argument, firmware_of_text
 from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
-from hil.report import BLUE, GREY, ORANGE, RED, ResultFolder
+from hil.picture import BLUE, GREY, ORANGE, RED
+from hil.report import ResultFolder
 from hil.run.options import BenchError, check_bit_rate
 from hil.scenario import CONTROLLERS, law_of
 from hil.signals import decoded, signal_of

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hil.measure import METRICS
 from hil.study import paper
-from hil.study.evaluation import METRICS
 from hil.study.figures import MAPPED_POINT
 from hil.study.html_page import render
 

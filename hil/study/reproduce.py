@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from rich.table import Table
 
+from hil.progress import progress_bars
 from hil.report import ResultFolder
 from hil.run.options import INTERRUPTED, InterruptedRunError
 from hil.run.stopping import StopFlag
@@ -61,7 +62,7 @@ def evaluate(
     stopped : StopFlag
         Ends it early.
     progress : rich.progress.Progress
-        Shows how far it is.
+        From `hil.progress.progress_bars`; shows how far it is.
 
     Returns
     -------
@@ -76,11 +77,11 @@ def evaluate(
     from hil.study.state_space import validate
 
     pairs = [(name, one) for name in scenarios for one in taking_part]
-    runs = _all(cores, [partial(play, pair) for pair in pairs], stopped, progress, "playing")
+    runs = _all(cores, [partial(play, pair) for pair in pairs], stopped, progress, "playing", "runs")
     analyses: list[Callable[[], Any]] = [
         partial(stability_of, taking_part, point) for point in OPERATING_POINTS
     ]
-    validation, *stability = _all(cores, [validate, *analyses], stopped, progress, "analysing")
+    validation, *stability = _all(cores, [validate, *analyses], stopped, progress, "analysing", "analyses")
     evaluation = Evaluation(
         taking_part=taking_part,
         scenarios=scenarios,
@@ -90,7 +91,7 @@ def evaluate(
         validation=validation,
     )
     tables = tables_of(evaluation)
-    drawn = _all(cores, _drawings(folder, evaluation, tables), stopped, progress, "drawing")
+    drawn = _all(cores, _drawings(folder, evaluation, tables), stopped, progress, "drawing", "pictures")
     pictures = [path for paths in drawn for path in paths]
     made = [folder / "tables.json", folder / "report.html"]
     made[0].write_text(_json(tables), encoding="utf-8")
@@ -107,7 +108,9 @@ def _swept(
     from hil.study.runs import figures_of
 
     sweeps = {one.label: sweep_of(one) for one in taking_part}
-    bar = progress.add_task("sweeping", total=sum(len(sweep.machines) for sweep in sweeps.values()))
+    bar = progress.add_task(
+        "sweeping", total=sum(len(sweep.machines) for sweep in sweeps.values()), unit="machines"
+    )
     swept, done = {}, 0
 
     def advance(machines: int) -> None:
@@ -158,10 +161,15 @@ def _draw(folder: Path, name: str, drawer: Callable[..., Any], content: Sequence
 
 
 def _all(
-    cores: Executor, tasks: Sequence[Callable[[], Any]], stopped: StopFlag, progress: Progress, what: str
+    cores: Executor,
+    tasks: Sequence[Callable[[], Any]],
+    stopped: StopFlag,
+    progress: Progress,
+    what: str,
+    unit: str,
 ) -> list[Any]:
     """Return what the tasks return, in their order; show how far they are and stop when asked to."""
-    bar = progress.add_task(what, total=len(tasks))
+    bar = progress.add_task(what, total=len(tasks), unit=unit)
     futures = [cores.submit(task) for task in tasks]
     pending: set[Future[Any]] = set(futures)
     while pending:
@@ -179,12 +187,10 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     from hil.study.runs import all_cores
 
     stopped = StopFlag.on_signals()
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with (
         ResultFolder(arguments.out) as folder,
         all_cores() as cores,
-        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
+        progress_bars() as progress,
     ):
         tables, made = evaluate(folder.scratch, list(paper.CASES), contestants(), cores, stopped, progress)
         folder.move_in(made)

@@ -15,11 +15,12 @@ import numpy as np
 from dbc.jit import source_digest
 from firmware_py.calibration import Calibration
 from hil.closed_loop import play_closed_loop
+from hil.measure import METRICS
 from hil.run.options import BenchError
 from hil.scenario import Scenario, load_scenario
 from plant_sim.machine import Machine
 
-FIGURES = ("rms_mm", "max_mm", "chatter_rpm")
+FIGURES = tuple(METRICS)
 """What is kept of each run; see `hil.closed_loop.ClosedLoopRun`."""
 
 BOX_RUNS = ("sine", "sine_load", "lift_lower_load", "full_stroke")

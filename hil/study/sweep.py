@@ -3,14 +3,15 @@
 import csv
 import hashlib
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from firmware_py.chosen_tuning import ChosenTuning
-from hil.report import BLUE, GREY, RED
+from hil.measure import METRICS
+from hil.picture import BLUE, GREY, RED
 from hil.scenario import Scenario, law_of
 from hil.study.box import WHOLE, Box
 from hil.study.runs import FAILED_RMS_MM, FIGURES, failed
@@ -159,6 +160,13 @@ def write_samples(path: Path, sweep: Sweep, figures: np.ndarray) -> None:
                 writer.writerow([sample, name, *asdict(machine).values(), *run, int(failed(run[0]))])
 
 
+def axis_label(key: str) -> str:
+    """Return what a key of `plant_sim.machine.Machine` is called on an axis, with its unit."""
+    (metadata,) = (item.metadata for item in fields(Machine) if item.name == key)
+    called, unit = metadata["called"], metadata["unit"]
+    return f"{called} / {f'({unit})' if '/' in unit else unit}" if unit else called
+
+
 def draw(path: Path, sweep: Sweep, figures: np.ndarray, summary: dict[str, Any]) -> None:
     """Draw the RMS error over each key of the box: what it depends on."""
     import matplotlib  # 0.3 s, which only drawing should cost
@@ -191,10 +199,11 @@ def draw(path: Path, sweep: Sweep, figures: np.ndarray, summary: dict[str, Any])
             axis.plot(values[chosen], rms_mm[chosen], ".", color=colour, ms=4, alpha=0.7)
         axis.axhline(FAILED_RMS_MM, color=GREY, lw=0.9, ls="--")
         axis.set_yscale("log")
-        axis.set_xlabel(key)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_xlabel(axis_label(key))
         axis.xaxis.set_major_locator(MaxNLocator(5, integer=key in WHOLE))
         axis.grid(alpha=0.3)
     for axis in axes[:, 0]:
-        axis.set_ylabel("RMS error / mm")
+        axis.set_ylabel(METRICS["rms_mm"][0])
     picture.savefig(path, dpi=110)
     pyplot.close(picture)

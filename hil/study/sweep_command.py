@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from firmware_py.chosen_tuning import add_tuning_arguments, tuning_of
+from hil.measure import METRICS
+from hil.progress import progress_bar
 from hil.report import ResultFolder
 from hil.run.options import BenchError, InterruptedRunError
 from hil.run.stopping import StopFlag
@@ -21,12 +22,6 @@ if TYPE_CHECKING:
     from hil.study.sweep import Sweep
 
 DEFAULT_SAMPLES = 500
-
-_LABELS = {
-    "rms_mm": "RMS error / mm",
-    "max_mm": "maximum error / mm",
-    "chatter_rpm": "chatter / rpm per step",
-}
 
 
 def add_command(commands: Any) -> None:
@@ -71,12 +66,12 @@ def run_command(arguments: argparse.Namespace) -> int:
     pool = dask_cluster(arguments.cluster) if arguments.cluster else all_cores(arguments.workers)
     with ResultFolder(out) as folder:
         begin_s = time.perf_counter()
-        with pool as executor, _progress(len(sweep.machines)) as bar:
+        with pool as executor, progress_bar("sweep", len(sweep.machines), sweep.kind) as show:
 
             def advance(done: int) -> None:
                 if stopped.is_set():
                     raise InterruptedRunError(f"interrupted after {done} of {len(sweep.machines)} samples")
-                bar.update(bar.task_ids[0], completed=done)
+                show(completed=done)
 
             figures = figures_of(
                 sweep.tuning.calibration,
@@ -131,14 +126,6 @@ def _sweep_of(arguments: argparse.Namespace) -> "Sweep":
     )
 
 
-def _progress(samples: int) -> Progress:
-    console = Console(stderr=True)
-    columns = TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    bar.add_task("sweep", total=samples)
-    return bar
-
-
 def _table(summary: dict[str, Any]) -> Table:
     table = Table(
         title=f"{', '.join(summary['scenarios'])}, {summary['tuning']} ({summary['controller']}), "
@@ -146,11 +133,10 @@ def _table(summary: dict[str, Any]) -> Table:
     )
     for heading in ("", "median", "95 % interval", "95th percentile", "worst"):
         table.add_column(heading, justify="right" if heading else "left")
-    for name, label in _LABELS.items():
-        spread = summary[name]
-        between = _interval(spread["median_low"], spread["median_high"], ".3f")
-        cells = (_number(spread[key], ".3f") for key in ("median", "p95", "worst"))
-        median, p95, worst = cells
+    for name, (label, decimals) in METRICS.items():
+        spread, form = summary[name], f".{decimals}f"
+        between = _interval(spread["median_low"], spread["median_high"], form)
+        median, p95, worst = (_number(spread[key], form) for key in ("median", "p95", "worst"))
         table.add_row(label, median, between, p95, worst)
     share = summary["failure_share"]
     between = _interval(share["low"], share["high"], ".1%")

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from firmware_py.tuning import TUNINGS
+from hil.progress import progress_bar
 from hil.run.options import BenchError, InterruptedRunError
 from hil.run.stopping import StopFlag
 from hil.scenario import controller_of
@@ -55,11 +55,14 @@ def run_command(arguments: argparse.Namespace) -> int:
         raise BenchError(f"--out is {block_file}: the block needs another suffix, its .toml goes beside it")
     machines = machines_of(load_box(arguments.box), arguments.samples, arguments.seed)
     stopped = StopFlag.on_signals()
-    with all_cores(arguments.workers) as executor, _progress(arguments.evaluations) as bar:
+    with (
+        all_cores(arguments.workers) as executor,
+        progress_bar("tune: the start", arguments.evaluations, "candidates") as show,
+    ):
 
         def advance(search: "Search") -> None:
             shown = f"cost {search.best.cost:.3f}" if search.best.within_limits else "none within the limits"
-            bar.update(bar.task_ids[0], completed=search.evaluations, description=f"tune: {shown}")
+            show(completed=search.evaluations, description=f"tune: {shown}")
             if stopped.is_set():
                 raise SearchStoppedError
 
@@ -83,14 +86,6 @@ def run_command(arguments: argparse.Namespace) -> int:
     if stopped.is_set():
         raise InterruptedRunError(f"interrupted after {search.evaluations} candidates, the best is kept")
     return 0
-
-
-def _progress(evaluations: int) -> Progress:
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    bar.add_task("tune: the start", total=evaluations)
-    return bar
 
 
 def _table(search: "Search") -> Table:

@@ -48,7 +48,7 @@ def test_the_scheduled_law_meets_its_limits(name):
 @pytest.mark.parametrize(("position_lsb_um", "limit_rpm"), [(1, 1.5), (10, 3.0)])
 def test_its_command_does_not_chatter(position_lsb_um, limit_rpm):
     run = play_closed_loop(load_scenario("sine"), BLOCK, machine=Machine(position_lsb_um=position_lsb_um))
-    assert run.chatter_rpm <= limit_rpm
+    assert run.chatter_rpm_per_period <= limit_rpm
 
 
 @pytest.mark.parametrize("tuning", FLOATS)

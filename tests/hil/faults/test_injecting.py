@@ -10,7 +10,6 @@ from fractions import Fraction
 from pathlib import Path
 
 import can
-import matplotlib
 import numpy as np
 import pytest
 from bench_runs import SAFETY_NET_S, background, serving, sha256, short_scenario, wait_until
@@ -27,7 +26,6 @@ from hil.closed_loop import play_closed_loop
 from hil.faults.catalogue import KINDS, fault_of_text
 from hil.faults.fault import FaultError
 from hil.inject_command import take_faults
-from hil.report import draw
 from hil.run.inprocess import InprocessRig, run_inprocess
 from hil.run.lockstep import run_lockstep
 from hil.run.options import Recording, RigOptions, RunOptions
@@ -111,15 +109,6 @@ def test_file_command_line_and_test_play_the_same(tmp_path, rig, capsys):
     assert result["reproducible"] is True
     times_s = [fault["at_s"] for fault in bench.result("x")["faults"]]
     assert times_s == pytest.approx([0.05, 0.06, 0.0702, 0.1])
-
-
-def test_the_picture_names_them(tmp_path, rig):
-    bench = Bench(rig)
-    bench.inject("load_step", force_n=-500, at_s=0.01)
-    bench.run(0.02)
-    with matplotlib.rc_context({"svg.fonttype": "none"}):
-        draw(tmp_path / "picture.svg", bench.result("x"), bench.trace)
-    assert ">load_step</text>" in (tmp_path / "picture.svg").read_text()
 
 
 def test_a_fault_begins_at_its_nanosecond(rig):

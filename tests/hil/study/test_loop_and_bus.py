@@ -51,7 +51,7 @@ def agreed(scenario: Scenario, tuning: str, controller: str) -> ClosedLoopRun:
     assert sha256(run.command_rpm) == sha256(trace["target_velocity_rpm"])
     assert np.array_equal(run.position_m, trace["position_m"])
     figures = result["rms_mm"], result["max_mm"], result["chatter_rpm_per_period"]
-    assert (run.rms_mm, run.max_mm, run.chatter_rpm) == figures
+    assert (run.rms_mm, run.max_mm, run.chatter_rpm_per_period) == figures
     return run
 
 
