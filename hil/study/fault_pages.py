@@ -126,17 +126,19 @@ def draw(path: Path, played: Sequence[Played]) -> None:
         row, column = divmod(index, columns)
         position, speed = axes[2 * row, column], axes[2 * row + 1, column]
         time_ms = one.course["time_s"] * 1e3
-        position.set_title(f"{PHASES[one.case.phase].title}: {one.case.name}", fontsize="x-small")
+        position.set_title(f"{PHASES[one.case.phase].title}:\n{one.case.name}", fontsize="small")
         position.plot(time_ms, one.course["reference_m"] * 1e3, color=GREY, lw=2.5, label="reference")
         position.plot(time_ms, one.course["position_m"] * 1e3, color=BLUE, lw=1.2, label="position")
-        speed.plot(time_ms, one.course["motor_speed_rpm"], color=ORANGE, lw=1.0, label="motor")
+        speed.plot(time_ms, one.course["motor_speed_rpm"], color=ORANGE, lw=1.0, label="motor speed")
         for axis in (position, speed):
             axis.axvline(0.0, color=GREY, lw=0.8, ls="--")
             axis.grid(alpha=0.3)
+        if index == 0:
+            position.legend(fontsize="small")
+            speed.legend(fontsize="small")
         if column == 0:
             position.set_ylabel("position / mm")
-            speed.set_ylabel("speed / rpm")
-    axes[0, 0].legend(fontsize="small")
+            speed.set_ylabel("motor speed / rpm")
     for unused in range(len(played), rows * columns):
         row, column = divmod(unused, columns)
         axes[2 * row, column].remove()

@@ -162,7 +162,7 @@ def _shown(difference: "Difference", replayed: "Replay", contract: Contract) -> 
 
 
 def _print(result: dict[str, Any]) -> None:
-    table = Table(title=f"{result['log']} replayed under {result['tuning']}", box=None)
+    table = Table(title=f"{result['log']} replayed under {_under(result)}", box=None)
     table.add_column("message", no_wrap=True)
     for heading in COUNTS.values():
         table.add_column(heading, justify="right")
@@ -177,6 +177,11 @@ def _print(result: dict[str, Any]) -> None:
         where = f"{first['time_s']:.6f} s ({first['since_reset_s']:.6f} s after the reset)"
         print(f"\nfirst difference of {first['message']}: {where}")
         console.print(_beside(first["recorded"], first["computed"]))
+
+
+def _under(result: dict[str, Any]) -> str:
+    """Return what the log was replayed under: tuning, control law and firmware."""
+    return f"{result['tuning']} ({result['controller'] or 'the law of the log'}), {result['firmware']}"
 
 
 def _beside(recorded: dict[str, Any] | None, computed: dict[str, Any] | None) -> Table:
@@ -244,7 +249,7 @@ def draw(path: Path, result: dict[str, Any], replayed: "Replay", contract: Contr
     velocity, difference = axes
     periods = result["periods"]
     figure.suptitle(
-        f"{result['log']} under {result['tuning']}\n"
+        f"{result['log']} under {_under(result)}\n"
         f"{periods['equal']} of {periods['compared']} control periods equal"
     )
     velocity.plot(recorded.time_s, recorded.values, color=GREY, lw=3, label="recorded")

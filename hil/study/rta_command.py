@@ -109,7 +109,9 @@ def _figures(traffic: list[Traffic], bit_rate: int, rows: list[ResponseTime]) ->
 
 def _table(traffic: list[Traffic], bit_rate: int, rows: list[ResponseTime]) -> Table:
     share = float(100 * load(traffic, bit_rate))
-    table = Table(title=f"{bit_rate / 1e3:g} kbit/s, load at most {share:.1f} %; times in µs", box=None)
+    unbounded = "- is no bound" if any(row.worst_ns is None for row in rows) else None
+    title = f"{bit_rate / 1e3:g} kbit/s, load at most {share:.1f} %; times in µs"
+    table = Table(title=title, caption=unbounded, box=None)
     for heading in ("message", "id"):
         table.add_column(heading, no_wrap=True)
     for heading in ("period", "frame", "blocked", "worst", "deadline", ""):

@@ -78,15 +78,18 @@ class StabilityMap:
         summary : dict
             ``machines``, and how many of them are somewhere unstable, ``unstable_machines``;
             ``largest_spectral_radius`` and ``largest_ms`` (None where unstable), each with its ``..._at_mm``
-            and ``..._machine``; ``first_ms``, the first machine's largest (None if somewhere unstable).
+            and ``..._machine``; of the first machine ``first_ms``, its largest (None if somewhere
+            unstable), and ``first_unstable_from_mm``, the first position where it is (None if nowhere).
         """
         radius, ms = self.loop.spectral_radius, self.loop.ms
+        first_unstable_mm = (self.positions_m[~self.loop.stable[0]] * 1e3).tolist()
         return {
             "machines": len(self.machines),
             "unstable_machines": int((~self.loop.stable).any(axis=1).sum()),
             **self._worst("largest_spectral_radius", radius),
             **self._worst("largest_ms", ms),
             "first_ms": _finite(ms[0].max()),
+            "first_unstable_from_mm": first_unstable_mm[0] if first_unstable_mm else None,
         }
 
     def _worst(self, name: str, values: np.ndarray) -> dict[str, Any]:

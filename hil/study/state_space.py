@@ -231,7 +231,7 @@ def figure_3b(validation: Validation) -> Callable[["Figure"], None]:
         position.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
         error.set_ylabel("error / mm")
         error.set_ylim(-20.0, 50.0)
-        speed.set_ylabel("rod's speed / mm/s")
+        speed.set_ylabel("rod's speed / (mm/s)")
         speed.set_xlabel("time / s")
         speed.legend()
 

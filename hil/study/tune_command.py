@@ -24,16 +24,28 @@ def add_command(commands: Any) -> None:
         "tune",
         help="make a tuning's worst errors over a box of machines small",
         usage="hil tune [options]",
-        epilog="Ctrl-C keeps the best so far. exit codes: 0 written; 2 wrong input, or limits out of reach; "
-        "130 interrupted",
+        epilog="Ctrl-C keeps the best so far.\n"
+        "exit codes: 0 written; 2 wrong input, or limits out of reach; 130 interrupted",
         formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=40),
     )
     tune.set_defaults(command=run_command)
-    tune.add_argument("--tuning", choices=TUNINGS, default="robust", metavar="START", help="default robust")
+    tune.add_argument(
+        "--tuning",
+        choices=TUNINGS,
+        default="robust",
+        metavar="START",
+        help="gains to begin with, and the law (default robust)",
+    )
     tune.add_argument("--samples", type=int, default=16, metavar="N", help="machines, half corners (16)")
     tune.add_argument("--seed", type=int, default=0, metavar="S", help="of machines and search (default 0)")
     tune.add_argument("--evaluations", type=int, default=100, metavar="M", help="candidates (default 100)")
-    tune.add_argument("--max-ms", type=float, default=2.0, metavar="MS", help="nominal machine (default 2)")
+    tune.add_argument(
+        "--max-ms",
+        type=float,
+        default=2.0,
+        metavar="MS",
+        help="largest Ms allowed on the nominal machine (default 2)",
+    )
     tune.add_argument("--box", type=Path, metavar="FILE", help="another box than hil/study/box.toml")
     tune.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
     tune.add_argument(

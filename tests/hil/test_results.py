@@ -280,6 +280,11 @@ def test_the_list_names_every_scenario(capsys):
         ["bus", "--help"],
         ["inject", "--help"],
         ["list", "--help"],
+        ["tune", "--help"],
+        ["faults", "--help"],
+        ["reproduce", "--help"],
+        ["rta", "--help"],
+        ["cost", "--help"],
     ],
     ids=" ".join,
 )

@@ -28,7 +28,7 @@ from pathlib import Path
 import can
 import numpy as np
 from numba import njit
-from readme_figures import BENCH, speed_table, write_to_readme
+from readme_figures import BENCH, speed_table, write_to_page
 
 from dbc.frame import Frame
 from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
@@ -217,7 +217,7 @@ def main() -> int:
     machine["python"] = platform.python_version()
     report = {"rounds": arguments.rounds, "machine": machine, "figures": figures}
     BENCH.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    write_to_readme("bench", speed_table())
+    write_to_page("bench", speed_table())
     return 0
 
 

@@ -4,7 +4,7 @@ import json
 import sys
 from typing import Any
 
-from readme_figures import README, ROOT, write_to_readme
+from readme_figures import README, ROOT, write_to_page
 
 from firmware_py.chosen_firmware import COST
 from hil.study.cost_command import HEADINGS, rows
@@ -93,7 +93,7 @@ BLOCKS = {
 def main() -> int:
     """Rewrite all blocks."""
     for (block, page), content in BLOCKS.items():
-        write_to_readme(block, content(), page)
+        write_to_page(block, content(), page)
     return 0
 
 

@@ -3,7 +3,7 @@
 import json
 import sys
 
-from readme_figures import ROOT, write_to_readme
+from readme_figures import ROOT, write_to_page
 
 from hil import cli
 from hil.study.fault_pages import markdown
@@ -19,7 +19,7 @@ def main() -> int:
     if code not in (EXIT_OK, EXIT_UNEXPECTED):
         return code
     matrix = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
-    write_to_readme("matrix", markdown(matrix), PAGE)
+    write_to_page("matrix", markdown(matrix), PAGE)
     return code
 
 

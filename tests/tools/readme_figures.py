@@ -1,4 +1,4 @@
-"""The figures in README: tracking from ``hil reproduce`` (``make figures``), speed from ``make bench``."""
+"""Figures in README and docs/studies.md: from ``hil reproduce`` (``make figures``) and ``make bench``."""
 
 import argparse
 import json
@@ -12,6 +12,7 @@ from hil import cli
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 TABLES = ROOT / "docs" / "tables.json"
+STUDIES = ROOT / "docs" / "studies.md"
 PICTURE = ROOT / "docs" / "figure_6.png"
 BENCH = ROOT / "docs" / "bench.json"
 CHATTER = "chatter_rpm_per_period"
@@ -52,6 +53,41 @@ def _errors(figures: dict[str, Any] | None, bold: set[str]) -> str:
     return " / ".join(f"**{text}**" if metric in bold else text for metric, text in texts.items())
 
 
+def stability_table() -> str:
+    """Return in how many machines of the box each linear loop is unstable, and the nominal Ms."""
+    tables = json.loads(TABLES.read_text(encoding="utf-8"))
+    points = tables["stability"]
+    corners = next(iter(points["held"].values()))["box"]["machines"]
+    heads = (f"`{point}`: unstable of {corners} | nominal Ms" for point in points)
+    lines = [f"| tuning, law | {' | '.join(heads)} |", "|---" * (1 + 2 * len(points)) + "|"]
+    for label, one in tables["contestants"].items():
+        cells = (_stability(by_label[label]) for by_label in points.values())
+        lines.append(f"| {one['tuning']}, {one['law']} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _stability(summary: dict[str, Any]) -> str:
+    nominal = summary["nominal_and_corners"]
+    ms, from_mm = nominal["first_ms"], nominal["first_unstable_from_mm"]
+    shown = f"unstable, first at {from_mm:g} mm" if ms is None else f"{ms:.2f}"
+    return f"{summary['box']['unstable_machines']} | {shown}"
+
+
+def state_space_table() -> str:
+    """Return how far each form of eq. (8) is from the plant."""
+    forms = json.loads(TABLES.read_text(encoding="utf-8"))["state_space"]
+    plants = next(iter(forms.values()))["errors_mm"]
+    heads = (*(f"{plant}, RMS / max mm" for plant in plants), "gain at 0.2 m, m/rad", "mode at 0.15 m, Hz")
+    lines = [f"| form | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
+    for form, one in forms.items():
+        left = one["left_stroke_s"]
+        until = "" if left is None else f" until it runs away at {left:.2f} s"
+        errors = (f"{error['rms']:.2f} / {error['max']:.2f}{until}" for error in one["errors_mm"].values())
+        others = f"{one['speed_gain_m_per_rad']:.2e} | {one['mode_hz']:.1f}"
+        lines.append(f"| {form} | {' | '.join(errors)} | {others} |")
+    return "\n".join(lines) + "\n"
+
+
 SPEED_ROWS = (  # figure of bench.json, what it is, unit, format
     ("inprocess_x", "all nodes in one process, over the bus", "x real time", ".1f"),
     ("lockstep_x", "three processes in lock-step, over the bus", "x real time", ".1f"),
@@ -84,14 +120,14 @@ def speed_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def in_readme(block: str) -> str:
-    """Return what README shows in the block of that name now."""
+def in_page(block: str, page: Path = README) -> str:
+    """Return what a page shows in the block of that name now."""
     begin, end = _marks(block)
-    return README.read_text(encoding="utf-8").split(begin)[1].split(end)[0]
+    return page.read_text(encoding="utf-8").split(begin)[1].split(end)[0]
 
 
-def write_to_readme(block: str, content: str, page: Path = README) -> None:
-    """Replace the block of that name, in README or on another page."""
+def write_to_page(block: str, content: str, page: Path = README) -> None:
+    """Replace the block of that name."""
     begin, end = _marks(block)
     before, rest = page.read_text(encoding="utf-8").split(begin)
     page.write_text(before + begin + content + end + rest.split(end)[1], encoding="utf-8")
@@ -113,7 +149,9 @@ def main() -> int:
         return code
     for file in (TABLES, PICTURE):
         shutil.copy(out / file.name, file)
-    write_to_readme("figures", table())
+    write_to_page("figures", table())
+    write_to_page("stability", stability_table(), STUDIES)
+    write_to_page("state space", state_space_table(), STUDIES)
     return 0
 
 

@@ -1,16 +1,21 @@
-"""README's figures are those of the last evaluation, which tests/hil repeats, and of the last bench."""
+"""Pages show the last evaluation, which tests/hil repeats, and the last bench."""
 
 import re
 
-from readme_figures import ROOT, in_readme, speed_table, table
+from readme_figures import ROOT, STUDIES, in_page, speed_table, stability_table, state_space_table, table
 
 
 def test_readme_shows_the_last_evaluation():
-    assert in_readme("figures") == table()
+    assert in_page("figures") == table()
+
+
+def test_the_studies_show_the_last_evaluation():
+    assert in_page("stability", STUDIES) == stability_table()
+    assert in_page("state space", STUDIES) == state_space_table()
 
 
 def test_readme_shows_what_the_last_bench_measured():
-    assert in_readme("bench") == speed_table()
+    assert in_page("bench") == speed_table()
 
 
 def test_the_tests_that_the_paper_page_names_exist():
