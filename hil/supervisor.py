@@ -67,6 +67,8 @@ class Supervisor:
         Number of the next period since power-on.
     silent : set of int
         Ids of own messages that are held back.
+    bench_frames : list of Frame
+        What it has sent on the bench channel.
     """
 
     name = "supervisor"
@@ -80,6 +82,7 @@ class Supervisor:
         self.start_ns = 0
         self.next_period = 0
         self.silent: set[int] = set()
+        self.bench_frames: list[Frame] = []
         self._setpoint = contract.position_setpoint
         self._command = contract.controller_command
         self._bench_control = contract.bench_control
@@ -201,6 +204,8 @@ class Supervisor:
             frames.append(self._command_frame())
         if loaded:
             frames.append(self._bench_load.frame(self._bench_load.pack(self._load_n)))
+        bench_channel = (self._bench_control.can_id, self._bench_load.can_id)
+        self.bench_frames += [frame for frame in frames if frame.can_id in bench_channel]
         return frames
 
     def _position_in(self, period: int) -> tuple[float, int]:

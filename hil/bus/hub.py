@@ -27,6 +27,12 @@ QUEUE_FRAMES = 100_000
 _DISCARD_ROWS = 4096
 _IDLE_POLL_S = 0.2
 _LAST_FLUSH_S = 2.0
+_ONE_ANSWER = ("fault", "faults")
+"""Roles of those who ask, are answered, and leave."""
+
+_TOLD_FAULTS = 200
+"""The newest, which one packet has room for."""
+
 _FRAMES_PER_SERVICE = 64
 """Frames taken from one participant at a time; one that sends faster than the bus carries is made to wait."""
 
@@ -179,6 +185,8 @@ class Hub:
     ----------
     take_fault : callable
         Has a fault, as a table, that somebody asks for; raises ValueError with the reason if it cannot.
+    taken : list of dict
+        Faults that it had, as tables, each with its ``bus_time_s``.
     agenda : Agenda
         What is to be done to the wire, in wall time.
     """
@@ -191,6 +199,7 @@ class Hub:
         self.nodes: dict[str, RemoteNode] = {}
         self.injections: list[tuple[int, Frame]] = []
         self.take_fault: Callable[[dict[str, Any]], None] = _take_no_fault
+        self.taken: list[dict[str, Any]] = []
         self.agenda = Agenda(wire)
         self._dropped_by_gone = 0
         self._expected = expected
@@ -355,7 +364,7 @@ class Hub:
         except (LinkError, OSError):
             connection.close()
             return
-        if "error" in answer or hello["role"] == "fault":
+        if "error" in answer or hello["role"] in _ONE_ANSWER:
             connection.close()
             return
         if self._virtual and hello["role"] == "node":
@@ -370,16 +379,20 @@ class Hub:
     def _answer_to(self, hello: dict[str, Any]) -> dict[str, Any]:
         if error := self._refusal(hello):
             return {"error": error}
+        bus_time_s = self.wire.now_ns / 1e9
+        if hello["role"] == "faults":
+            return {"faults": self.taken[-_TOLD_FAULTS:]}
         if hello["role"] == "fault":
             try:
                 self.take_fault(hello["fault"])
             except ValueError as error:
                 return {"error": str(error)}
+            self.taken.append(hello["fault"] | {"bus_time_s": bus_time_s})
         return {
             "virtual": self._virtual,
             "bit_rate": self.wire.bit_rate,
             "data_bit_rate": self.wire.data_bit_rate,
-            "bus_time_s": self.wire.now_ns / 1e9,
+            "bus_time_s": bus_time_s,
         }
 
     def _refusal(self, hello: dict[str, Any]) -> str | None:
@@ -429,7 +442,7 @@ def _take_no_fault(table: dict[str, Any]) -> None:
 
 def _is_complete(hello: dict[str, Any]) -> bool:
     """Tell whether a greeting has all that its role needs."""
-    if hello.get("role") == "bus":
+    if hello.get("role") in ("bus", "faults"):
         return True
     if hello.get("role") == "fault":
         return isinstance(hello.get("fault"), dict)

@@ -69,14 +69,18 @@ class Listener:
         return np.array(self._payloads, np.uint64).reshape(-1, 8)
 
     def traffic(self, ratio: Fraction) -> np.ndarray:
-        """Return what was heard on the nodes' time base; see `hil.run.options.Recording`.
-
-        The frame that was passed on fastest ties the bus's clock to ours.
-        """
-        heard = list(self._heard)
-        offset_ns = min((heard_ns - stamp_ns for heard_ns, stamp_ns, *_ in heard), default=0)
+        """Return what was heard on the nodes' time base; see `hil.run.options.Recording`."""
+        heard, offset_ns = list(self._heard), self._clock_offset_ns()
         rows = [(shared_ns(stamp_ns + offset_ns, ratio), *frame) for _, stamp_ns, *frame in heard]
         return np.array(rows, dtype=np.uint64).reshape(-1, 4)
+
+    def node_ns(self, stamp_ns: int, ratio: Fraction) -> int:
+        """Return a time of the bus's clock on the nodes' time base."""
+        return shared_ns(stamp_ns + self._clock_offset_ns(), ratio)
+
+    def _clock_offset_ns(self) -> int:
+        """Return how far our clock is ahead of the bus's; the frame that was passed on fastest ties them."""
+        return min((heard_ns - stamp_ns for heard_ns, stamp_ns, *_ in list(self._heard)), default=0)
 
     def _run(self) -> None:
         try:

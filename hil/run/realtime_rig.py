@@ -4,14 +4,20 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from statistics import median
 from threading import Thread
+from typing import Any
+
+import numpy as np
 
 from dbc.node import PERIOD_NS
 from firmware_py.chosen_tuning import chosen_tuning
+from hil.bus import link
+from hil.bus.link import LinkError
 from hil.bus.opening import BusSettings, bus_settings, open_bus
 from hil.bus.wire import Clock, Port
 from hil.faults.fault import Fault, Stage
@@ -110,7 +116,8 @@ class RealtimeRig(Rig):
     def _open(self, stack: ExitStack) -> None:
         settings = stack.enter_context(_bus_to_use(self.options))
         self.bus = stack.enter_context(open_bus(*settings))
-        fd = settings.interface == "hilbus"  # of other interfaces it may need an adapter for CAN FD
+        self.hub_channel = settings.channel if settings.interface == "hilbus" else None
+        fd = self.hub_channel is not None  # of other interfaces it may need an adapter for CAN FD
         self.listener = Listener(stack.enter_context(open_bus(*settings, fd=fd)))
         self.processes = stack.enter_context(NodeProcesses(self.options, settings))
         stack.enter_context(self.listener.listening())
@@ -224,9 +231,10 @@ class RealtimeSession:
         shown = supervisor["time_ns"] < until_ns
         traffic = self._rig.listener.traffic(options.rt_ratio)
         times_ns = traffic[:, 0]
+        traffic = traffic[(times_ns >= begin_ns) & (times_ns < until_ns)]
         records = {name: load_record(options, name) for name in SIDES & options.started}
         return Recording(
-            traffic=traffic[(times_ns >= begin_ns) & (times_ns < until_ns)],
+            traffic=traffic,
             supervisor={name: column[shown] for name, column in supervisor.items()},
             plant=records.get("plant"),
             controller=records.get("controller"),
@@ -242,6 +250,8 @@ class RealtimeSession:
             notes={
                 "rt_ratio": float(options.rt_ratio),
                 "supervisor_lateness": self._runner.lateness.summary(),
+                "injected_faults": self._injected_faults(begin_ns, until_ns),
+                "injections": self._injections(traffic),
             },
         )
 
@@ -257,6 +267,33 @@ class RealtimeSession:
         """Stop at once; idempotent."""
         self._stopping = True
         self._thread.join()
+
+    def _injected_faults(self, begin_ns: int, until_ns: int) -> list[dict[str, Any]]:
+        """Return the faults that the hub was asked for in a time, as in a scenario; `at_s` in node time."""
+        if self._rig.hub_channel is None:
+            return []
+        ratio, found = self._rig.options.rt_ratio, []
+        with suppress(LinkError):  # a hub that has gone tells no more
+            connection, answer = link.connect(self._rig.hub_channel, {"role": "faults"})
+            connection.close()
+            for fault in answer["faults"]:
+                asked_ns = self._rig.listener.node_ns(round(fault.pop("bus_time_s") * 1e9), ratio)
+                if begin_ns <= asked_ns < until_ns:
+                    since_start_s = (asked_ns - self.supervisor.start_ns) / 1e9
+                    found.append(fault | {"at_s": since_start_s + fault.get("at_s", 0.0) * float(ratio)})
+        return found
+
+    def _injections(self, traffic: np.ndarray) -> list[tuple[float, int, int, int]]:
+        """Return the frames on the bench channel that are not the supervisor's, their times in s."""
+        contract = self._rig.contract
+        bench_channel = (contract.bench_control.can_id, contract.bench_load.can_id)
+        own, found = Counter(map(tuple, self.supervisor.bench_frames)), []
+        for time_ns, *frame in traffic[np.isin(traffic[:, 1], bench_channel)].tolist():
+            if own[tuple(frame)]:
+                own[tuple(frame)] -= 1
+            else:
+                found.append((time_ns / 1e9, *frame))
+        return found
 
     def _run(self) -> None:
         try:

@@ -22,6 +22,7 @@ from firmware_py.node import PHASE_NS
 from hil import cli
 from hil.bench import Bench
 from hil.bus import link
+from hil.bus.messages import to_message
 from hil.closed_loop import play_closed_loop
 from hil.faults.catalogue import KINDS, fault_of_text
 from hil.faults.fault import FaultError
@@ -232,6 +233,36 @@ def test_hil_inject_into_a_lockstep_run(tmp_path, capsys):
     assert [fault["kind"] for fault in result["faults"]] == ["sensor_bias", "cut_off", "leak"]
     assert result["reproducible"] is False
     assert f"{result['faults'][0]['at_s'] + result['scenario_start_bus_s']:.6f} s" in said
+
+
+def test_what_is_injected_into_a_real_time_run_is_on_record(tmp_path):
+    options = RigOptions(record_directory=tmp_path, rt_ratio=Fraction(1, 5), channel="live")
+    with RealtimeRig(options) as rig, can.Bus(interface="hilbus", channel="live") as other:
+        assert cli.main(["inject", "live", "sensor_noise,rms_m=1e-6"]) == 0
+        bench = Bench(rig)
+        bench.inject("load_step", force_n=-700)
+        bench.run(0.1)
+        assert bench.result("x")["notes"]["injections"] == [], "what the bench does itself is none"
+        begin_s = bench.time_s
+        assert cli.main(["inject", "live", "sensor_bias,bias_m=0.25", "drop,message=DriveStatus,at_s=1"]) == 0
+        bench.run(0.2)
+        load = CONTRACT.bench_load.frame(CONTRACT.bench_load.pack(-900))
+        other.send(to_message(0, load, "live"))
+        bench.run(0.4)
+        result, end_s = bench.result("x"), bench.time_s
+    own, bias, drop = result["faults"]
+    assert own["kind"] == "load_step"
+    assert bias == {"kind": "sensor_bias", "bias_m": 0.25, "at_s": bias["at_s"]}
+    assert begin_s <= bias["at_s"] <= end_s
+    assert drop == {"kind": "drop", "message": "DriveStatus", "at_s": drop["at_s"]}
+    assert begin_s + 0.2 <= drop["at_s"] <= end_s + 0.2, "1 s of wall time later, at a ratio of 1/5"
+    (bias_s, *bias_frame), (load_s, *load_frame) = result["notes"]["injections"]
+    control = CONTRACT.bench_control.unpack(bias_frame[2])
+    assert control == (BenchCommand.SET_FAULT, BenchFault.SENSOR_BIAS, 250_000)
+    assert load_frame == list(load)
+    assert (
+        begin_s <= bias_s - result["scenario_start_bus_s"] <= load_s - result["scenario_start_bus_s"] <= end_s
+    )
 
 
 def told(capsys: pytest.CaptureFixture[str], channel: str, fault: str) -> str:
