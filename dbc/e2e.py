@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
-from numba.extending import register_jitable
 
 from dbc import profile2
 from dbc.jit import entry_point, njit
 from dbc.profile2 import LOST_DATA, MAX_COUNTER, STATE_SIZE
-from dbc.restricted import register
+from dbc.restricted import high_half, low_half, register
 
 SOURCES = ("dbc.e2e", "dbc.machine", "dbc.profile2", "dbc.restricted")
 """What code that is compiled with these functions depends on."""
@@ -40,18 +39,6 @@ class Status(IntEnum):
 ACCEPTED = (int(Status.OK), int(Status.OKSOMELOST), int(Status.SYNC))
 """Statuses whose data may be used."""
 
-_LOW_MASK = 0xFFFF_FFFF
-
-
-@register_jitable
-def _low(data):  # type: ignore[no-untyped-def]
-    return np.int64(data & np.uint64(_LOW_MASK))
-
-
-@register_jitable
-def _high(data):  # type: ignore[no-untyped-def]
-    return np.int64(data >> np.uint64(32))
-
 
 @njit("int64(uint64, int64, int64)", depends=SOURCES)
 def profile2_crc(data: int, dlc: int, data_id: int) -> int:
@@ -66,7 +53,7 @@ def profile2_crc(data: int, dlc: int, data_id: int) -> int:
     data_id : int
         DataID that belongs to the payload's counter, 0..255.
     """
-    return profile2.profile2_crc(_low(data), _high(data), dlc, data_id)
+    return profile2.profile2_crc(low_half(data), high_half(data), dlc, data_id)
 
 
 @njit("uint64(int64[::1], int64[::1], uint64)", depends=SOURCES)
@@ -83,8 +70,8 @@ def profile2_protect(counter, configuration, data):  # type: ignore[no-untyped-d
         Payload as an unsigned integer, byte 0 in the low eight bits.
     """
     counter[0] = (counter[0] + 1) & MAX_COUNTER
-    low = profile2.profile2_protect(configuration, 0, counter[0], _low(data), _high(data))
-    return (data & ~np.uint64(_LOW_MASK)) | np.uint64(low)
+    low = profile2.profile2_protect(configuration, 0, counter[0], low_half(data), high_half(data))
+    return (data & ~np.uint64(0xFFFF_FFFF)) | np.uint64(low)
 
 
 @njit("int64(int64[::1], int64[::1], uint64, int64)", depends=SOURCES)
@@ -102,7 +89,7 @@ def profile2_check(state, configuration, data, arrived):  # type: ignore[no-unty
     arrived : int
         0 if nothing arrived since the last call; `data` is not looked at then.
     """
-    return profile2.profile2_check(state, 0, configuration, 0, _low(data), _high(data), arrived)
+    return profile2.profile2_check(state, 0, configuration, 0, low_half(data), high_half(data), arrived)
 
 
 def receiver_configuration(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic, overload, register_jitable
 
 from dbc import machine
 
@@ -33,6 +33,18 @@ overload(machine.clz)(lambda value: lambda value: np.int32(_leading_zeros(np.int
 overload(machine.div32)(
     lambda dividend, divisor: lambda dividend, divisor: np.int32(np.uint32(dividend) // np.uint32(divisor))
 )
+
+
+@register_jitable
+def low_half(data):  # type: ignore[no-untyped-def]
+    """Bytes 0 to 3 of a payload, which is a uint64."""
+    return np.int64(data & np.uint64(0xFFFF_FFFF))
+
+
+@register_jitable
+def high_half(data):  # type: ignore[no-untyped-def]
+    """Bytes 4 to 7 of a payload, which is a uint64."""
+    return np.int64(data >> np.uint64(32))
 
 
 def register(module: ModuleType) -> None:

@@ -7,6 +7,7 @@ from numba.extending import register_jitable
 
 from dbc.jit import entry_point, njit
 from dbc.machine import low32
+from dbc.restricted import high_half, low_half
 from firmware_py import task
 from firmware_py import task_layout as at
 from firmware_py.compiled import SOURCES
@@ -64,8 +65,7 @@ def set_execution_time(memory: np.ndarray, share_0p5percent: int) -> None:
 def take_frame(memory, can_id, length, data):  # type: ignore[no-untyped-def]
     """Receive interrupt; `data` is a uint64."""
     contract, mailboxes, words = memory[_CONTRACT], memory[_MAILBOXES], memory[_TASK]
-    low = low32(np.int64(data & np.uint64(0xFFFF_FFFF)))  # type: ignore[arg-type]
-    high = low32(np.int64(data >> np.uint64(32)))  # type: ignore[arg-type]
+    low, high = low32(low_half(data)), low32(high_half(data))
     task.receive(contract, mailboxes, words, low32(can_id), length, low, high)
 
 
