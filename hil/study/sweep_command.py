@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from hil.study.sweep import Sweep
 
 DEFAULT_SAMPLES = 500
+EXIT_OK, EXIT_FAILURES = range(2)
 
 
 def add_command(commands: Any) -> None:
@@ -30,7 +32,7 @@ def add_command(commands: Any) -> None:
         "sweep",
         help="play scenarios on many machines of a box",
         usage="hil sweep SCENARIO... [options]   (names as in `hil list`, or .toml)",
-        epilog="exit codes: 0 played, however many samples failed; 2 wrong input or no answer;\n"
+        epilog="exit codes: 0 no more samples failed than may; 1 more; 2 wrong input or no answer;\n"
         "3 a process was lost; 130 interrupted",
         formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=40),
     )
@@ -46,6 +48,9 @@ def add_command(commands: Any) -> None:
     sweep.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help="default: the tuning's own")
     add_tuning_arguments(sweep)
     sweep.add_argument("--duration", type=float, metavar="S", help="cut the scenarios short, s")
+    sweep.add_argument(
+        "--max-failures", type=int, default=0, metavar="N", help="samples that may fail (default 0)"
+    )
     where = sweep.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
     where.add_argument("--cluster", metavar="ADDRESS", help="a Dask scheduler's, instead of processes here")
@@ -55,12 +60,14 @@ def add_command(commands: Any) -> None:
 
 def run_command(arguments: argparse.Namespace) -> int:
     """Run ``hil sweep`` and return the exit code."""
-    from hil.study.runs import all_cores, dask_cluster, figures_of  # compiles the loop when it has changed
+    from hil.study.runs import FAILED_RMS_MM, all_cores, dask_cluster, figures_of  # compiles a changed loop
     from hil.study.sweep import draw, write_samples
 
     sweep = _sweep_of(arguments)
     if arguments.workers is not None and arguments.workers < 1:
         raise BenchError(f"--workers is {arguments.workers}, must be 1 or more")
+    if arguments.max_failures < 0:
+        raise BenchError(f"--max-failures is {arguments.max_failures}, must be 0 or more")
     stopped = StopFlag.on_signals()
     out = arguments.out or Path("out") / f"sweep-{'-'.join(scenario.name for scenario in sweep.scenarios)}"
     pool = dask_cluster(arguments.cluster) if arguments.cluster else all_cores(arguments.workers)
@@ -90,12 +97,19 @@ def run_command(arguments: argparse.Namespace) -> int:
         folder.move_in(made)
     if arguments.json:
         print(text)
-        return 0
-    Console().print(_table(summary))
-    for entry in summary["failed"]:
-        print(entry["replay"])
-    print(f"{', '.join(file.name for file in made)} in {out}")
-    return 0
+    else:
+        Console().print(_table(summary))
+        for entry in summary["failed"]:
+            print(entry["replay"])
+        print(f"{', '.join(file.name for file in made)} in {out}")
+    if summary["failures"] <= arguments.max_failures:
+        return EXIT_OK
+    print(
+        f"hil: {summary['failures']} of {summary['samples']} {sweep.kind} failed, RMS error above "
+        f"{FAILED_RMS_MM:g} mm or no number; {arguments.max_failures} may (--max-failures)",
+        file=sys.stderr,
+    )
+    return EXIT_FAILURES
 
 
 def _sweep_of(arguments: argparse.Namespace) -> "Sweep":

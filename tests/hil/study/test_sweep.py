@@ -33,8 +33,8 @@ SHORT = ["sweep", "sine", "--duration", "0.5", "--samples", "40"]
 
 
 def swept(out: Path, *arguments: str) -> dict:
-    """Run a sweep in this process and return sweep.json."""
-    assert cli.main([*arguments, "--out", str(out)]) == 0
+    """Run a sweep in this process, however many samples fail, and return sweep.json."""
+    assert cli.main([*arguments, "--max-failures", "1000", "--out", str(out)]) == 0
     return json.loads((out / "sweep.json").read_text())
 
 
@@ -116,6 +116,23 @@ def test_the_share_of_failures_has_the_interval_of_clopper_and_pearson(tmp_path,
     share = swept(tmp_path, *SHORT)["failure_share"]
     assert share["value"] == share["low"] == 0.0
     assert share["high"] == pytest.approx(1 - 0.025 ** (1 / 40), rel=1e-6)
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_more_failures_than_may_are_an_exit_code_and_a_line(tmp_path, capsys, quickly, form):
+    arguments = ["sweep", "sine", "--samples", "30", "--seed", "4", "--tuning", "paper", *form]
+    out = ["--out", str(tmp_path)]
+    assert cli.main([*arguments, *out]) == 1
+    said = capsys.readouterr()
+    failures = json.loads((tmp_path / "sweep.json").read_text())["failures"]
+    line = (
+        f"hil: {failures} of 30 samples failed, RMS error above 2 mm or no number; 0 may (--max-failures)\n"
+    )
+    assert said.err == line
+    assert cli.main([*arguments, "--max-failures", str(failures - 1), *out]) == 1
+    assert f"{failures - 1} may" in capsys.readouterr().err
+    assert cli.main([*arguments, "--max-failures", str(failures), *out]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_a_failed_sample_played_over_the_bus_gives_the_same_figures(sine, tmp_path, capsys):
@@ -313,6 +330,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
         (["sine", "--box", "none.toml"], "box: cannot read none.toml"),
         (["sine", "--box", os.devnull], "box: it is empty"),
         (["sine", "--duration", "0"], "duration_s"),
+        (["sine", "--max-failures", "-1"], "--max-failures is -1, must be 0 or more"),
         (["sine", "--out", "/proc/nothing"], "cannot write to /proc/nothing"),
     ],
 )
