@@ -1,7 +1,8 @@
 """The calibration block as flashed: a versioned header, the kernel's int32 words, a CRC-32.
 
 Layout, little endian: magic "DDHC", uint16 layout version, uint16 default control law, uint16 number of
-words, uint16 zero, the words, uint32 CRC-32 (zlib's) of all that precedes it.
+words, uint16 zero, the words, uint32 CRC-32 (zlib's) of all that precedes it. At power-on the firmware checks
+it once more (`firmware_py.calibration_block`).
 """
 
 import struct
@@ -10,74 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from firmware_py import calibration_block
+from firmware_py import task_layout as at
+from firmware_py.calibration_block import GAINS, LIMITS, MAX_SHIFT, MIN_SHIFT, ZONES
 from firmware_py.kernel import layout as k
 from firmware_py.kernel.fal import log2_q22
+from firmware_py.kernel.fixedpoint import INT32_MAX
 
-MAGIC = b"DDHC"
+MAGIC = calibration_block.MAGIC.to_bytes(4, "little")
 _HEADER = struct.Struct("<4sHHHH")
 _CRC = struct.Struct("<I")
 
-INT32_MAX = 2**31 - 1
-MIN_SHIFT, MAX_SHIFT = 8, 62
-"""A gain's shift: with 8 or more, sums of a few gains' outputs stay far within 64 bits."""
+BLOCK_BYTES = 4 * at.BLOCK_SIZE
 
-GAINS = (
-    k.CAL_P_KP,
-    k.CAL_PI_KP,
-    k.CAL_PI_KI,
-    k.CAL_TD_K,
-    k.CAL_TD_H,
-    k.CAL_LEAD_V1,
-    k.CAL_LEAD_V2,
-    k.CAL_ESO_BETA1,
-    k.CAL_ESO_BETA2,
-    k.CAL_ESO_BETA3,
-    k.CAL_ESO_BETA4,
-    k.CAL_ESO_A1,
-    k.CAL_ESO_A2,
-    k.CAL_ESO_B0,
-    k.CAL_FB_K1,
-    k.CAL_FB_K2,
-    k.CAL_FB_K3,
-    k.CAL_FB_A1,
-    k.CAL_FB_A2,
-    k.CAL_FB_Z4,
-    k.CAL_FRONT_SMOOTH,
-    k.CAL_FRONT_LEAD,
-    k.CAL_FRONT_EXTEND,
-    k.CAL_FRONT_RETRACT,
-    k.CAL_COMMAND_SMOOTH,
-    k.CAL_SCHEDULED_BETA1,
-    k.CAL_SCHEDULED_BETA2,
-    k.CAL_SCHEDULED_BETA3,
-    k.CAL_SCHEDULED_BETA4,
-    k.CAL_SCHEDULED_BETA4_SOFT,
-    k.CAL_SCHEDULED_B0,
-    k.CAL_SCHEDULED_MOTOR,
-    k.CAL_SCHEDULED_K1,
-    k.CAL_SCHEDULED_K2,
-    k.CAL_SCHEDULED_K3,
-    k.CAL_SCHEDULED_K3_SOFT,
-)
-"""Indices of the mantissas; the shift follows each."""
-
-ZONES = (k.CAL_ESO_DELTA, k.CAL_FB_DELTA1, k.CAL_FB_DELTA2, k.CAL_FB_DELTA3)
-"""Indices of fal's linear zones; the logarithm follows each."""
-
-VALUE_RANGES = {
-    k.CAL_U_LIMIT: (1, INT32_MAX),
-    k.CAL_LIMITER_RATE: (1, 2**24),
-    k.CAL_LIMITER_SLEW: (1, 2**24),
-    k.CAL_LIMITER_BRAKE: (1, 2**24),
-    k.CAL_TD_D: (1, 2**25),
-    k.CAL_COMMAND_SLEW: (1, INT32_MAX),
-    k.CAL_STROKE: (1, INT32_MAX),
-    k.CAL_STIFFNESS_END_A: (1, INT32_MAX),
-    k.CAL_STIFFNESS_END_B: (1, INT32_MAX),
-    k.CAL_STIFFNESS_A: (1, INT32_MAX),
-    k.CAL_STIFFNESS_B: (1, INT32_MAX),
-} | dict.fromkeys(ZONES, (1, INT32_MAX))
-"""Legal values of the other words, logarithms left out; within them no 64-bit intermediate overflows."""
+VALUE_RANGES = dict.fromkeys(ZONES, (1, INT32_MAX)) | {index: (1, highest) for index, highest in LIMITS}
+"""Legal values of the words that are neither gains nor logarithms, by their indices."""
 
 WORD_NAMES = {
     value: name for name, value in vars(k).items() if name.startswith("CAL_") and name != "CAL_SIZE"
@@ -153,13 +101,17 @@ class Calibration:
         _, version, law, count, _ = _HEADER.unpack_from(block)
         if version != k.LAYOUT_VERSION:
             raise CalibrationError(f"calibration: layout version {version} instead of {k.LAYOUT_VERSION}")
-        expected = _HEADER.size + 4 * k.CAL_SIZE + _CRC.size
-        if count != k.CAL_SIZE or len(block) != expected:
+        if count != k.CAL_SIZE or len(block) != BLOCK_BYTES:
             raise CalibrationError(
-                f"calibration: {count} words in {len(block)} bytes instead of {k.CAL_SIZE} in {expected}"
+                f"calibration: {count} words in {len(block)} bytes instead of {k.CAL_SIZE} in {BLOCK_BYTES}"
             )
         body = block[: -_CRC.size]
         (crc,) = _CRC.unpack(block[-_CRC.size :])
         if crc != zlib.crc32(body):
             raise CalibrationError(f"calibration: CRC {crc:#010x} instead of {zlib.crc32(body):#010x}")
         return cls(law, struct.unpack_from(f"<{k.CAL_SIZE}i", block, _HEADER.size))
+
+
+def flashed(block: bytes) -> bytes:
+    """Return what `BLOCK_BYTES` of flash hold once a block is written; erased, if that has another size."""
+    return block if len(block) == BLOCK_BYTES else b"\xff" * BLOCK_BYTES

@@ -1,7 +1,5 @@
 """The firmware's entry points as machine code: power-on, receive and timer interrupt."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numba.extending import register_jitable
 
@@ -30,16 +28,14 @@ RECORD_COLUMNS = (
     "z4",
 )
 _RECORD_KERNEL_STATE = RECORD_COLUMNS.index("v1")
-NOT_CALIBRATED = 0
-"""Stands for the control law where there is no valid calibration."""
-
 
 # the arrays of `firmware_py.task` in one block of memory
 _CONTRACT = slice(0, at.CONTRACT_SIZE)
 _MAILBOXES = slice(_CONTRACT.stop, _CONTRACT.stop + at.MAILBOXES_SIZE)
 _TASK = slice(_MAILBOXES.stop, _MAILBOXES.stop + at.TASK_SIZE)
-_CALIBRATION = slice(_TASK.stop, _TASK.stop + k.CAL_SIZE)
-_STATE = slice(_CALIBRATION.stop, _CALIBRATION.stop + k.ST_SIZE)
+_BLOCK = slice(_TASK.stop, _TASK.stop + at.BLOCK_SIZE)
+_CALIBRATION = slice(_BLOCK.start + at.BLOCK_WORDS, _BLOCK.start + at.BLOCK_CRC)
+_STATE = slice(_BLOCK.stop, _BLOCK.stop + k.ST_SIZE)
 _IO = slice(_STATE.stop, _STATE.stop + k.IO_SIZE)
 FRAMES_SENT = slice(_IO.stop, _IO.stop + at.FRAMES_SIZE)
 
@@ -51,9 +47,9 @@ def new_memory(contract: np.ndarray) -> np.ndarray:
     return memory
 
 
-def flash_calibration(memory: np.ndarray, words: Sequence[int]) -> None:
-    """Put the words of a calibration into memory."""
-    memory[_CALIBRATION] = words
+def flash_calibration(memory: np.ndarray, block: bytes) -> None:
+    """Put a calibration block into memory, `BLOCK_BYTES` of `firmware_py.calibration`."""
+    memory[_BLOCK] = np.frombuffer(block, "<i4")
 
 
 def set_execution_time(memory: np.ndarray, share_0p5percent: int) -> None:
@@ -108,10 +104,10 @@ def fill_row(row, now_ns, words, state, io):  # type: ignore[no-untyped-def]
     row[_RECORD_KERNEL_STATE:] = state[k.ST_V1 : k.ST_Z4 + 1]
 
 
-@njit("void(int32[::1], int64)", depends=SOURCES)
-def _power_on(memory, law):  # type: ignore[no-untyped-def]
+@njit("void(int32[::1])", depends=SOURCES)
+def _power_on(memory):  # type: ignore[no-untyped-def]
     contract, mailboxes, words = memory[_CONTRACT], memory[_MAILBOXES], memory[_TASK]
-    task.power_on(contract, mailboxes, words, memory[_STATE], memory[_IO], law)
+    task.power_on(contract, mailboxes, words, memory[_BLOCK], memory[_STATE], memory[_IO])
 
 
 @njit("void(int32[::1], int64, int64, uint64)", depends=SOURCES)

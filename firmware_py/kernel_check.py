@@ -27,6 +27,7 @@ MODULES = (
     "firmware_py.signals",
     "firmware_py.mailbox",
     "firmware_py.state_machine",
+    "firmware_py.calibration_block",
     "firmware_py.task",
 )
 """What is in the subset, beside the control kernel."""

@@ -1,6 +1,5 @@
 """The controller node: which of the firmware's entry points runs when. Integers only."""
 
-from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from dbc.record import Record
 from firmware_py import entry_points
 from firmware_py import task_layout as at
 from firmware_py.answer import answer_timer
-from firmware_py.calibration import Calibration, CalibrationError
+from firmware_py.calibration import flashed
 from firmware_py.contract_words import contract_words, received, sent
 
 EXECUTION_NS = 100_000
@@ -36,7 +35,7 @@ class Controller:
     contract : Contract
         The DBC.
     calibration_block : bytes
-        As flashed; a damaged one keeps the controller in power-on.
+        What is flashed; a damaged one keeps the controller in power-on.
     execution_ns : int
         From the timer to transmission.
 
@@ -51,13 +50,13 @@ class Controller:
     def __init__(
         self, contract: Contract, calibration_block: bytes, execution_ns: int = EXECUTION_NS
     ) -> None:
-        self._calibration_block = calibration_block
         self._execution_ns = execution_ns
         received_ids = [message.can_id for message in received(contract)]
         self.accepts = frozenset({*received_ids, contract.bench_control.can_id})
         self.latched = self.accepts
         self.transmits = frozenset(message.can_id for message in sent(contract))
         self._memory = entry_points.new_memory(contract_words(contract))
+        entry_points.flash_calibration(self._memory, flashed(calibration_block))
         self._sends = np.zeros((at.MAX_FRAMES, len(Frame._fields)), np.uint64)
         self._row = np.zeros(len(entry_points.RECORD_COLUMNS), np.int64)
         self._receive = partial(entry_points.receive, self._memory)
@@ -67,12 +66,7 @@ class Controller:
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on: forget everything, check the calibration."""
-        law = entry_points.NOT_CALIBRATED
-        with suppress(CalibrationError):
-            calibration = Calibration.from_bytes(self._calibration_block)
-            entry_points.flash_calibration(self._memory, calibration.words)
-            law = calibration.law
-        entry_points.power_on(self._memory, law)
+        entry_points.power_on(self._memory)
         entry_points.set_execution_time(self._memory, execution_time(self._execution_ns))
         return Actions(next_period(now_ns))
 

@@ -6,6 +6,7 @@
 
 from dbc.machine import Array32, i32, int32
 from dbc.profile2 import MAX_COUNTER, profile2_protect
+from firmware_py.calibration_block import law_of_block
 from firmware_py.kernel.control import control_reset, control_step
 from firmware_py.kernel.layout import (
     FLAG_SPEED_LIMITED,
@@ -174,10 +175,10 @@ def restart(task: Array32, state: Array32, io: Array32) -> None:
 
 
 def power_on(
-    contract: Array32, mailboxes: Array32, task: Array32, state: Array32, io: Array32, law: int32
+    contract: Array32, mailboxes: Array32, task: Array32, block: Array32, state: Array32, io: Array32
 ) -> None:
-    """Power-on with a calibration for `law`, 0 if there is no valid one."""
-    task[DEFAULT_LAW] = law
+    """Power-on: check the calibration as flashed, forget everything."""
+    task[DEFAULT_LAW] = law_of_block(block)
     task[EXECUTION_TIME] = ASSUMED_EXECUTION_TIME
     empty(contract, mailboxes)
     restart(task, state, io)

@@ -1,13 +1,23 @@
-"""Named indices of the control task's flat int32 arrays `contract`, `mailboxes`, `task` and `frames`.
+"""Named indices of the control task's int32 arrays `block`, `contract`, `mailboxes`, `task` and `frames`.
 
-`contract` says what the DBC file says: what is expected of each message received, then where the signals of
-the others lie. A signal lies at two words: its start bit and its length.
+`block` is the calibration as flashed; the bytes of a word lie low byte first. `contract` says what the DBC
+file says: what is expected of each message received, then where the signals of the others lie. A signal lies
+at two words: its start bit and its length.
 """
 
 from dbc.profile2 import CONFIGURATION_SIZE, STATE_SIZE
+from firmware_py.kernel.layout import CAL_SIZE
 
 MAX_FIELDS = 3
 STALE_CYCLES = 3  # cycles of a message without valid data after which it counts as lost
+
+# block
+BLOCK_MAGIC = 0
+BLOCK_VERSION = 1  # layout version in the low half, default control law in the high one
+BLOCK_COUNT = 2  # number of the calibration's words in the low half
+BLOCK_WORDS = 3  # where they begin
+BLOCK_CRC = BLOCK_WORDS + CAL_SIZE  # CRC-32 of all before it
+BLOCK_SIZE = BLOCK_CRC + 1
 
 # mailboxes
 MAILBOXES = 4

@@ -3,9 +3,11 @@
 import math
 from dataclasses import dataclass, field
 
-from firmware_py.calibration import INT32_MAX, MAX_SHIFT, MIN_SHIFT, VALUE_RANGES, WORD_NAMES, Calibration
+from firmware_py.calibration import VALUE_RANGES, WORD_NAMES, Calibration
+from firmware_py.calibration_block import MAX_SHIFT, MIN_SHIFT
 from firmware_py.kernel import layout as k
 from firmware_py.kernel.fal import log2_q22
+from firmware_py.kernel.fixedpoint import INT32_MAX
 
 PERIOD_S = 1e-3
 

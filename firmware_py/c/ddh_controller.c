@@ -659,6 +659,120 @@ static int32_t fal_3_4(const int32_t *calibration, int32_t zone, int32_t e)
     return fal(e, calibration[zone], octaves - (octaves >> 2));
 }
 
+/* calibration_block: The calibration block as flashed, in restricted Python: which words are legal, and the check
+ * at power-on.
+ *
+ * See firmware_py.task_layout for its words; firmware_py.calibration makes a block and says what is wrong
+ * with one.
+ */
+
+enum {
+    DDH_MAGIC = 1128809540, /* "DDHC" */
+};
+
+/* a gain's shift: with 8 or more, sums of a few gains' outputs stay far within 64 bits */
+enum {
+    DDH_MIN_SHIFT = 8,
+    DDH_MAX_SHIFT = 62,
+};
+
+/* columns of LIMITS */
+enum {
+    DDH_WORD = 0,
+    DDH_HIGHEST = 1,
+};
+
+/* indices of the gains' mantissas, legal within +-INT32_MAX; the shift follows each */
+static const uint8_t DDH_GAINS[36] = {
+    DDH_CAL_P_KP, DDH_CAL_PI_KP, DDH_CAL_PI_KI, DDH_CAL_TD_K, DDH_CAL_TD_H, DDH_CAL_LEAD_V1, DDH_CAL_LEAD_V2,
+    DDH_CAL_ESO_BETA1, DDH_CAL_ESO_BETA2, DDH_CAL_ESO_BETA3, DDH_CAL_ESO_BETA4, DDH_CAL_ESO_A1, DDH_CAL_ESO_A2,
+    DDH_CAL_ESO_B0, DDH_CAL_FB_K1, DDH_CAL_FB_K2, DDH_CAL_FB_K3, DDH_CAL_FB_A1, DDH_CAL_FB_A2, DDH_CAL_FB_Z4,
+    DDH_CAL_FRONT_SMOOTH, DDH_CAL_FRONT_LEAD, DDH_CAL_FRONT_EXTEND, DDH_CAL_FRONT_RETRACT, DDH_CAL_COMMAND_SMOOTH,
+    DDH_CAL_SCHEDULED_BETA1, DDH_CAL_SCHEDULED_BETA2, DDH_CAL_SCHEDULED_BETA3, DDH_CAL_SCHEDULED_BETA4,
+    DDH_CAL_SCHEDULED_BETA4_SOFT, DDH_CAL_SCHEDULED_B0, DDH_CAL_SCHEDULED_MOTOR, DDH_CAL_SCHEDULED_K1,
+    DDH_CAL_SCHEDULED_K2, DDH_CAL_SCHEDULED_K3, DDH_CAL_SCHEDULED_K3_SOFT
+};
+
+/* indices of fal's linear zones, legal from 1 on; the logarithm follows each */
+static const uint8_t DDH_ZONES[4] = {
+    DDH_CAL_ESO_DELTA, DDH_CAL_FB_DELTA1, DDH_CAL_FB_DELTA2, DDH_CAL_FB_DELTA3
+};
+
+/* of the other words: index and highest legal value, from 1 on; so no 64-bit intermediate overflows */
+static const int32_t DDH_LIMITS[11][2] = {
+    {DDH_CAL_U_LIMIT, DDH_INT32_MAX},
+    {DDH_CAL_LIMITER_RATE, 0x1000000},
+    {DDH_CAL_LIMITER_SLEW, 0x1000000},
+    {DDH_CAL_LIMITER_BRAKE, 0x1000000},
+    {DDH_CAL_TD_D, 0x2000000},
+    {DDH_CAL_COMMAND_SLEW, DDH_INT32_MAX},
+    {DDH_CAL_STROKE, DDH_INT32_MAX},
+    {DDH_CAL_STIFFNESS_END_A, DDH_INT32_MAX},
+    {DDH_CAL_STIFFNESS_END_B, DDH_INT32_MAX},
+    {DDH_CAL_STIFFNESS_A, DDH_INT32_MAX},
+    {DDH_CAL_STIFFNESS_B, DDH_INT32_MAX},
+};
+
+/* of four bits: their remainder by the polynomial 0x04C11DB7, bits reversed */
+static const int32_t DDH_CRC32_TABLE[16] = {
+    0x00000000, 0x1DB71064, 0x3B6E20C8, 0x26D930AC, 0x76DC4190, 0x6B6B51F4, 0x4DB26158, 0x5005713C, -0x12477CE0,
+    -0x0FF06CBC, -0x29295C18, -0x349E4C74, -0x649B3D50, -0x792C2D2C, -0x5FF51D88, -0x42420DE4
+};
+
+/* CRC-32 of all that precedes the block's own: zlib's, of the words as little endian bytes. */
+static int32_t block_crc(const int32_t *block)
+{
+    int32_t crc = -1;
+    for (int32_t place = 0; place < DDH_BLOCK_CRC; place++) {
+        crc = crc ^ block[place];
+        for (int32_t nibble = 0; nibble < 8; nibble++) {
+            crc = ((crc >> 4) & 0x0FFFFFFF) ^ DDH_CRC32_TABLE[crc & 15];
+        }
+    }
+    return crc ^ (-1);
+}
+
+/* Whether all words of a calibration block are in their ranges, logarithms being those of the zones. */
+static int32_t words_are_legal(const int32_t *block)
+{
+    for (int32_t row = 0; row < 36; row++) {
+        int32_t mantissa = DDH_BLOCK_WORDS + (int32_t)DDH_GAINS[row];
+        int32_t shift = block[mantissa + 1];
+        if ((block[mantissa] < (-DDH_INT32_MAX)) || (shift < DDH_MIN_SHIFT) || (shift > DDH_MAX_SHIFT)) {
+            return 0;
+        }
+    }
+    for (int32_t row = 0; row < 4; row++) {
+        int32_t zone = DDH_BLOCK_WORDS + (int32_t)DDH_ZONES[row];
+        if ((block[zone] < 1) || (block[zone + 1] != log2_q22(block[zone]))) {
+            return 0;
+        }
+    }
+    for (int32_t row = 0; row < 11; row++) {
+        int32_t word = block[DDH_BLOCK_WORDS + DDH_LIMITS[row][DDH_WORD]];
+        if ((word < 1) || (word > DDH_LIMITS[row][DDH_HIGHEST])) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Default control law of a calibration block, 0 if the block is not valid. */
+static int32_t law_of_block(const int32_t *block)
+{
+    int32_t law = (block[DDH_BLOCK_VERSION] >> 16) & 0xFFFF;
+    if ((block[DDH_BLOCK_MAGIC] != DDH_MAGIC) || ((block[DDH_BLOCK_VERSION] & 0xFFFF) != DDH_LAYOUT_VERSION)) {
+        return 0;
+    }
+    if (((block[DDH_BLOCK_COUNT] & 0xFFFF) != DDH_CAL_SIZE) || (block[DDH_BLOCK_CRC] != block_crc(block))) {
+        return 0;
+    }
+    if ((law < DDH_LAW_P) || (law > DDH_LAW_SCHEDULED) || (words_are_legal(block) == 0)) {
+        return 0;
+    }
+    return law;
+}
+
 /* eso: Extended state observer (eq. 26 with a linear zone): position, speed, acceleration, total disturbance. */
 
 /* Start at rest at position (2^-31 m), undisturbed. */
@@ -1233,11 +1347,11 @@ static void restart(int32_t *task, int32_t *state, int32_t *io)
     task[DDH_EXECUTION_TIME] = execution_time;
 }
 
-/* Power-on with a calibration for law, 0 if there is no valid one. */
-static void power_on(const int32_t *contract, int32_t *mailboxes, int32_t *task, int32_t *state, int32_t *io,
-        int32_t law)
+/* Power-on: check the calibration as flashed, forget everything. */
+static void power_on(const int32_t *contract, int32_t *mailboxes, int32_t *task, const int32_t *block,
+        int32_t *state, int32_t *io)
 {
-    task[DDH_DEFAULT_LAW] = law;
+    task[DDH_DEFAULT_LAW] = law_of_block(block);
     task[DDH_EXECUTION_TIME] = DDH_ASSUMED_EXECUTION_TIME;
     empty(contract, mailboxes);
     restart(task, state, io);
@@ -1511,8 +1625,8 @@ static const int32_t DDH_CONTRACT[DDH_CONTRACT_SIZE] = {
 
 void ddh_start(ddh_controller *controller)
 {
-    power_on(DDH_CONTRACT, controller->mailboxes, controller->task, controller->state, controller->io,
-            ddh_default_law);
+    power_on(DDH_CONTRACT, controller->mailboxes, controller->task, ddh_calibration, controller->state,
+            controller->io);
 }
 
 void ddh_receive(ddh_controller *controller, uint32_t can_id, uint8_t length, uint64_t data)
@@ -1524,8 +1638,8 @@ void ddh_receive(ddh_controller *controller, uint32_t can_id, uint8_t length, ui
 int32_t ddh_period(ddh_controller *controller, ddh_frame frames[DDH_MAX_FRAMES])
 {
     int32_t words[DDH_FRAMES_SIZE] = {0};
-    int32_t count = period(DDH_CONTRACT, controller->mailboxes, controller->task, ddh_calibration,
-            controller->state, controller->io, words);
+    int32_t count = period(DDH_CONTRACT, controller->mailboxes, controller->task,
+            &ddh_calibration[DDH_BLOCK_WORDS], controller->state, controller->io, words);
     for (int32_t i = 0; i < count; i++) {
         const int32_t *frame = &words[i * DDH_FRAME_SIZE];
         frames[i].can_id = (uint32_t)frame[DDH_FRAME_ID];

@@ -121,15 +121,26 @@ enum {
     DDH_CAL_SIZE = 91,
 };
 
-/* Named indices of the control task's flat int32 arrays contract, mailboxes, task and frames.
+/* Named indices of the control task's int32 arrays block, contract, mailboxes, task and frames.
  *
- * contract says what the DBC file says: what is expected of each message received, then where the signals of
- * the others lie. A signal lies at two words: its start bit and its length.
+ * block is the calibration as flashed; the bytes of a word lie low byte first. contract says what the DBC
+ * file says: what is expected of each message received, then where the signals of the others lie. A signal lies
+ * at two words: its start bit and its length.
  */
 
 enum {
     DDH_MAX_FIELDS = 3,
     DDH_STALE_CYCLES = 3, /* cycles of a message without valid data after which it counts as lost */
+};
+
+/* block */
+enum {
+    DDH_BLOCK_MAGIC = 0,
+    DDH_BLOCK_VERSION = 1, /* layout version in the low half, default control law in the high one */
+    DDH_BLOCK_COUNT = 2, /* number of the calibration's words in the low half */
+    DDH_BLOCK_WORDS = 3, /* where they begin */
+    DDH_BLOCK_CRC = 94, /* CRC-32 of all before it */
+    DDH_BLOCK_SIZE = 95,
 };
 
 /* mailboxes */
@@ -262,9 +273,8 @@ enum {
     DDH_FRAMES_SIZE = 12,
 };
 
-/* Calibration and its control law; see ddh_calibration.c. */
-extern const int32_t ddh_calibration[DDH_CAL_SIZE];
-extern const int32_t ddh_default_law;
+/* The calibration block; ddh_start checks it. See ddh_calibration.c. */
+extern const int32_t ddh_calibration[DDH_BLOCK_SIZE];
 
 typedef struct ddh_controller {
     int32_t mailboxes[DDH_MAILBOXES_SIZE];
@@ -280,7 +290,7 @@ typedef struct ddh_frame {
     uint64_t data;
 } ddh_frame;
 
-/* Power-on. */
+/* Power-on. Without a valid calibration the controller stays in the state PowerOn, and says so on the bus. */
 void ddh_start(ddh_controller *controller);
 
 /* Receive interrupt. It must not interrupt ddh_period, nor the other way round: give both one priority. */

@@ -22,7 +22,6 @@ SYMBOLS = (
     "ddh_calibration",
     "ddh_control_reset",
     "ddh_control_step",
-    "ddh_default_law",
     "idle",
     "reset_handler",
     "run_segment",

@@ -1,7 +1,5 @@
 """The controller node on an emulated processor: the same bus, the same interrupts, the exported C inside."""
 
-from contextlib import suppress
-
 import numpy as np
 
 from dbc.contract import Contract
@@ -10,7 +8,7 @@ from dbc.node import NOTHING, Actions, next_period
 from dbc.packet import answer_by_entry_points
 from firmware_py import entry_points
 from firmware_py import task_layout as at
-from firmware_py.calibration import Calibration, CalibrationError
+from firmware_py.calibration import flashed
 from firmware_py.chosen_firmware import FirmwareError
 from firmware_py.contract_words import contract_words
 from firmware_py.emulated.image import Image
@@ -34,7 +32,7 @@ class EmulatedController(Controller):
     contract : Contract
         The DBC; what the C was exported from, if it says the same.
     calibration_block : bytes
-        As flashed; a damaged one keeps the controller in power-on.
+        What is flashed; a damaged one keeps the controller in power-on.
     processor : str
         One of `firmware_py.emulated.processors.TARGETS`.
     image : Image
@@ -63,16 +61,11 @@ class EmulatedController(Controller):
                 "use --firmware python with it"
             )
         self.machine = Machine(processor, image)
+        self.machine.write(image.symbols["ddh_calibration"], flashed(calibration_block))
         self._address = image.symbols["controller"]
 
     def on_start(self, now_ns: int) -> Actions:
         """Power-on with the calibration that is flashed."""
-        law = entry_points.NOT_CALIBRATED
-        with suppress(CalibrationError):
-            calibration = Calibration.from_bytes(self._calibration_block)
-            law = calibration.law
-            self.machine.write_words(self.machine.image.symbols["ddh_calibration"], calibration.words)
-        self.machine.write_words(self.machine.image.symbols["ddh_default_law"], [law])
         self.machine.start()
         self.machine.write_words(self._address + 4 * _EXECUTION_TIME, [execution_time(self._execution_ns)])
         return Actions(next_period(now_ns))

@@ -36,18 +36,18 @@ def compiled_by_numba(
 ) -> np.ndarray:
     """Rows of what the bench runs."""
     memory = entry_points.new_memory(contract_words(contract))
-    entry_points.flash_calibration(memory, calibration.words)
+    entry_points.flash_calibration(memory, calibration.to_bytes())
     sends, record = (
         np.zeros((at.MAX_FRAMES, 3), np.uint64),
         np.zeros(len(entry_points.RECORD_COLUMNS), np.int64),
     )
     kept = [*range(at.CONTRACT_SIZE, at.CONTRACT_SIZE + at.MAILBOXES_SIZE + at.TASK_SIZE)]
-    kernel = kept[-1] + 1 + k.CAL_SIZE
+    kernel = kept[-1] + 1 + at.BLOCK_SIZE
     kept += range(kernel, kernel + k.ST_SIZE + k.IO_SIZE)
     rows = []
     for kind, frame in events:
         if kind == POWER_ON:
-            entry_points.power_on(memory, calibration.law)
+            entry_points.power_on(memory)
         elif kind == FRAME:
             entry_points.receive(memory, *frame)
         else:
@@ -61,8 +61,7 @@ def emulated(processor: str, calibration: Calibration, events: Iterable[Event]) 
     """Rows of the committed image of a processor."""
     machine = Machine(processor, reference_image(processor))
     symbols = machine.image.symbols
-    machine.write_words(symbols["ddh_calibration"], calibration.words)
-    machine.write_words(symbols["ddh_default_law"], [calibration.law])
+    machine.write(symbols["ddh_calibration"], calibration.to_bytes())
     rows = []
     for kind, frame in events:
         if kind == POWER_ON:
@@ -97,8 +96,9 @@ def interpreted(
 ) -> np.ndarray:
     """Rows of the source on checked integers."""
     task = modules["task"]
-    contract, flashed = (
-        checked.CheckedArray(words) for words in (contract_words(CONTRACT), calibration.words)
+    block = np.frombuffer(calibration.to_bytes(), "<i4")
+    contract, block, flashed = (
+        checked.CheckedArray(words) for words in (contract_words(CONTRACT), block, calibration.words)
     )
     mailboxes, words, state, io, frames = (
         checked.CheckedArray([0] * size)
@@ -107,7 +107,7 @@ def interpreted(
     rows = []
     for kind, frame in events:
         if kind == POWER_ON:
-            task.power_on(contract, mailboxes, words, state, io, checked.i32(calibration.law))
+            task.power_on(contract, mailboxes, words, block, state, io)
         elif kind == FRAME:
             data = [checked.low32(frame.data), checked.low32(frame.data >> 32)]
             numbers = checked.low32(frame.can_id), checked.i32(frame.dlc), *data

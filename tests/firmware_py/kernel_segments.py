@@ -6,18 +6,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from firmware_py.calibration import (
-    GAINS,
-    INT32_MAX,
-    MAX_SHIFT,
-    MIN_SHIFT,
-    VALUE_RANGES,
-    ZONES,
-    Calibration,
-)
+from firmware_py.calibration import VALUE_RANGES, Calibration
+from firmware_py.calibration_block import GAINS, MAX_SHIFT, MIN_SHIFT, ZONES
 from firmware_py.compiled import control_reset, control_step
 from firmware_py.kernel import layout as k
 from firmware_py.kernel.fal import log2_q22
+from firmware_py.kernel.fixedpoint import INT32_MAX
 from firmware_py.tuning import AdrcTuning, LimiterTuning, PiTuning, Tuning
 
 SEGMENT_STEPS = 100

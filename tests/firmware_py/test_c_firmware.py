@@ -13,10 +13,11 @@ from firmware_events import CONTRACT, FRAME, POWER_ON, TIMER, Event, Senders, fu
 from firmware_machines import WORDS, compiled_by_numba, in_c, interpreted
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from wire_runs import traffic_under
 
 from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
-from dbc.node import NOTHING, PERIOD_NS, Actions, next_period
+from dbc.node import NOTHING, Actions, next_period
 from dbc.record import Record
 from firmware_py import entry_points
 from firmware_py import task_layout as at
@@ -24,12 +25,7 @@ from firmware_py.c_export.files import export
 from firmware_py.chosen_tuning import chosen_tuning
 from firmware_py.diagnosis import State
 from firmware_py.node import EXECUTION_NS, Controller
-from hil.bus.wire import Wire
-from hil.run.inprocess import CLOCKS
 from hil.scenario import load_scenario
-from hil.supervisor import BRING_UP_PERIODS, Supervisor
-from plant_sim.node import Plant
-from plant_sim.parameters import NOMINAL
 
 HERE = Path(__file__).parent
 CALIBRATION = chosen_tuning().calibration
@@ -143,18 +139,6 @@ def library(tmp_path_factory):
     return ctypes.CDLL(
         str(compiled(directory / "ddh.so", sorted(EXPORTED.glob("*.c")), "-O2", "-shared", "-fPIC"))
     )
-
-
-def traffic_under(controller, scenario):
-    """All frames of a scenario's run, with their times."""
-    wire = Wire(1_000_000, frozenset({CONTRACT.bench_control.can_id}))
-    supervisor = Supervisor(CONTRACT, "scheduled", scenario.initial_m)
-    nodes = [supervisor, Plant(CONTRACT, NOMINAL), controller]
-    for port in [wire.attach(node, CLOCKS[node.name]) for node in nodes]:
-        wire.start(port)
-    supervisor.plan_scenario(scenario)
-    wire.run((BRING_UP_PERIODS + scenario.periods) * PERIOD_NS)
-    return wire.traffic
 
 
 def test_the_same_bus_with_the_c_in_place_of_python(library):

@@ -633,7 +633,8 @@ def test_the_status_shows_the_assumed_execution_time(running):
 def test_until_it_is_measured_a_tenth_of_the_period_is_assumed_to_be_executed():
     words = [0] * at.TASK_SIZE
     contract, mailboxes = contract_words(CONTRACT).tolist(), [0] * at.MAILBOXES_SIZE
-    task.power_on(contract, mailboxes, words, [0] * k.ST_SIZE, [0] * k.IO_SIZE, LAW_ADRC)
+    block = [0] * at.BLOCK_SIZE
+    task.power_on(contract, mailboxes, words, block, [0] * k.ST_SIZE, [0] * k.IO_SIZE)
     assert words[at.EXECUTION_TIME] * 0.5 == 10.0
 
 

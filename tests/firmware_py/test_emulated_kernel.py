@@ -7,7 +7,7 @@ import pytest
 from emulated_kernel import EmulatedKernel
 from kernel_segments import Segment, run_compiled, segments
 
-from firmware_py.calibration import ZONES
+from firmware_py.calibration_block import ZONES
 from firmware_py.emulated.processors import TARGETS
 from firmware_py.kernel import layout as k
 from firmware_py.kernel.fal import log2_q22

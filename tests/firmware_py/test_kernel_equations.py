@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dbc.contract import Contract
-from firmware_py.calibration import GAINS, ZONES
+from firmware_py.calibration_block import GAINS, ZONES
 from firmware_py.kernel import (
     adrc,
     command_filter,
