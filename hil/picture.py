@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from firmware_py.chosen_firmware import PYTHON
 from hil.faults.fault import text_of
 from hil.measure import M_TO_MM, Trace
 from plant_sim.machine import Machine
@@ -26,9 +27,11 @@ _LINE_LETTERS = 110
 
 
 def heading(result: dict[str, Any]) -> str:
-    """Return what was played: scenario, control law, tuning, machine and mode, from a run's `result`."""
-    machine = result["machine"]
+    """Return what was played: scenario, law, tuning, firmware, machine and mode, from a run's `result`."""
+    firmware, machine = result["firmware"], result["machine"]
     whose = f"{result['controller']} ({result['tuning'] or 'started elsewhere'})"
+    if firmware is not None and firmware["name"] != PYTHON:
+        whose += f" on {firmware['name']}"
     plant = "plant started elsewhere"
     if machine is not None:
         changes = Machine(**machine).changes

@@ -23,6 +23,7 @@ RESULT = {
     "scenario": "sine",
     "controller": "adrc",
     "tuning": "paper",
+    "firmware": {"name": "python", "execution_us": 100.0},
     "machine": NOMINAL | {"mass": 1.5, "delay_periods": 3},
     "mode": "lockstep",
     "bit_rate": 500_000,
@@ -55,8 +56,13 @@ def test_the_heading_names_scenario_law_tuning_machine_and_mode():
     assert heading(RESULT | {"machine": NOMINAL}) == "sine, adrc (paper), nominal machine, lockstep"
 
 
+def test_the_heading_names_a_compiled_firmware():
+    compiled = RESULT | {"machine": NOMINAL, "firmware": {"name": "cortex-m4", "execution_us": 28.0}}
+    assert heading(compiled) == "sine, adrc (paper) on cortex-m4, nominal machine, lockstep"
+
+
 def test_the_heading_says_which_side_was_started_elsewhere():
-    elsewhere = RESULT | {"machine": None, "tuning": None, "mode": "realtime"}
+    elsewhere = RESULT | {"machine": None, "tuning": None, "firmware": None, "mode": "realtime"}
     assert heading(elsewhere) == "sine, adrc (started elsewhere), plant started elsewhere, realtime"
 
 
