@@ -131,7 +131,7 @@ FAL = pytest.mark.parametrize(
         for how in (checked_fal, compiled_fal)
         for eighths in (1, 2, 6)
     ],
-    ids=[f"{alpha}-{how}" for how in ("checked", "compiled") for alpha in ("1/8", "1/4", "3/4")],
+    ids=[f"{how}-{alpha}" for how in ("checked", "compiled") for alpha in ("1/8", "1/4", "3/4")],
 )
 SWITCHING_ERROR = pytest.mark.parametrize(
     "switching_error",
@@ -302,9 +302,9 @@ def test_fal_is_monotonic(alpha, power, e, step, delta):
     assert power(e, delta) <= power(min(e + step, 2**31 - 1), delta)
 
 
-@FAL
 @pytest.mark.parametrize("delta", [1, 7, 214748, 2**31 - 2])
 @pytest.mark.parametrize("sign", [1, -1])
+@FAL
 def test_fal_is_continuous_at_delta(alpha, power, delta, sign):
     assert power(sign * delta, delta) == sign * delta
     assert 0 <= sign * power(sign * (delta + 1), delta) - delta <= 1
