@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hil import cli
+from hil.measure import METRICS
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -39,7 +40,7 @@ def table() -> str:
             ]
         )
     chatter = {label: figures[CHATTER] for label, figures in scenarios["sine"]["ours"].items()}
-    rows.append(["speed chatter on the sine, rpm per ms", *(f"{value:.1f}" for value in chatter.values())])
+    rows.append([f"{METRICS[CHATTER][0]}, sine", *(f"{value:.1f}" for value in chatter.values())])
     robustness = tables["robustness"]
     failures = [one["failures"] for one in robustness["contestants"].values()]
     rows.append([f"failures of {robustness['samples']} other machines", *map(str, failures)])
