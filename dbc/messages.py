@@ -106,6 +106,7 @@ class ControllerStatus(NamedTuple):
     drive_fault: Flag
     calibration_invalid: Flag
     mailbox_overrun: Flag
+    position_stuck: Flag
     execution_time: Annotated[int, Raw(8, factor=0.5)]
     saturations: U16
     mailbox_overruns: U16

@@ -28,6 +28,7 @@ MODULES = (
     "firmware_py.mailbox",
     "firmware_py.state_machine",
     "firmware_py.calibration_block",
+    "firmware_py.supervision",
     "firmware_py.task",
 )
 """What is in the subset, beside the control kernel."""

@@ -27,12 +27,14 @@ from firmware_py.state_machine import (
     ENABLE,
     FAULT_RESET,
     INPUTS_FRESH,
+    POSITION_MOVES,
     READY_TO_ENABLE,
     RUN,
     SAFE,
     STANDBY,
     next_state,
 )
+from firmware_py.supervision import STUCK_PERIODS, watch_motion
 from firmware_py.task_layout import (
     ARMED,
     BENCH_COMMAND,
@@ -78,6 +80,7 @@ from firmware_py.task_layout import (
     OBSERVER_PHASE,
     OBSERVER_STATE,
     OVERRUNS,
+    POSITION_STUCK,
     PROTECTION,
     RESET_ASKED,
     RESTART_ASKED,
@@ -102,6 +105,7 @@ from firmware_py.task_layout import (
     STATE,
     STATUS_PHASE,
     STATUSWORD,
+    STILL_PERIODS,
     TASK_SIZE,
     VELOCITY,
 )
@@ -233,6 +237,8 @@ def conditions_of(mailboxes: Array32, task: Array32) -> int32:
         conditions = conditions | ENABLE
     if (mailboxes[STATUSWORD] & STATE_MASK) == OPERATION_ENABLED:
         conditions = conditions | DRIVE_ENABLED
+    if task[STILL_PERIODS] < STUCK_PERIODS:
+        conditions = conditions | POSITION_MOVES
     return conditions
 
 
@@ -258,6 +264,8 @@ def faults_of(mailboxes: Array32, task: Array32, before: int32) -> int32:
     if task[STATE] == SAFE:
         if before == RUN and (statusword & STATE_MASK) != OPERATION_ENABLED:
             faults = faults | DRIVE_NOT_ENABLED
+        if task[STILL_PERIODS] >= STUCK_PERIODS:
+            faults = faults | POSITION_STUCK
         faults = faults | task[FAULTS]
     return faults
 
@@ -373,6 +381,7 @@ def period(
         poll(mailboxes, mailbox, contract, expected)
         mailbox = mailbox + MAILBOX_SIZE
         expected = expected + EXPECTATION_SIZE
+    watch_motion(task, mailboxes[FEEDBACK_POSITION])
     conditions = conditions_of(mailboxes, task)
     before = task[STATE]
     task[STATE] = next_state(before, conditions)

@@ -69,7 +69,7 @@ MESSAGE_ID = 0
 MESSAGE_LENGTH = 1
 MESSAGE_SIGNALS = 2
 SIGNAL_SIZE = 2
-FAULT_COUNT = 14
+FAULT_COUNT = 15
 
 DRIVE_COMMAND = PROTECTION + CONFIGURATION_SIZE
 SENT_CONTROLWORD = DRIVE_COMMAND + MESSAGE_SIGNALS
@@ -108,7 +108,9 @@ CYCLE = 11  # control periods, low 16 bits
 STATUS_PHASE = 12  # periods since ControllerStatus
 OBSERVER_PHASE = 13  # periods modulo those of ObserverState
 OBSERVER_PAGE = 14
-TASK_SIZE = 15
+STILL_POSITION = 15  # where the position was when it last moved or the motor was slow, um
+STILL_PERIODS = 16  # periods since then
+TASK_SIZE = 17
 
 # fault bits, in the order of ControllerStatus
 FEEDBACK_LOST = 1 << 0
@@ -125,6 +127,7 @@ DRIVE_NOT_ENABLED = 1 << 10
 DRIVE_FAULT = 1 << 11
 CALIBRATION_INVALID = 1 << 12
 MAILBOX_OVERRUN = 1 << 13
+POSITION_STUCK = 1 << 14
 
 # a frame to send
 FRAME_ID = 0

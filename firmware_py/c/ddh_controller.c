@@ -352,6 +352,7 @@ enum {
     DDH_ENABLE = 4,
     DDH_DRIVE_ENABLED = 8,
     DDH_FAULT_RESET = 16,
+    DDH_POSITION_MOVES = 32,
     DDH_READY_TO_ENABLE = 6,
 };
 
@@ -363,10 +364,11 @@ enum {
     DDH_TARGET = 3,
 };
 
-static const uint8_t DDH_TRANSITIONS[6][4] = {
+static const uint8_t DDH_TRANSITIONS[7][4] = {
     {DDH_POWER_ON, DDH_CALIBRATED, 0, DDH_STANDBY},
     {DDH_STANDBY, DDH_READY_TO_ENABLE | DDH_DRIVE_ENABLED, 0, DDH_RUN},
     {DDH_RUN, 0, DDH_INPUTS_FRESH, DDH_SAFE},
+    {DDH_RUN, 0, DDH_POSITION_MOVES, DDH_SAFE},
     {DDH_RUN, 0, DDH_ENABLE, DDH_STANDBY},
     {DDH_RUN, 0, DDH_DRIVE_ENABLED, DDH_SAFE},
     {DDH_SAFE, DDH_FAULT_RESET | DDH_INPUTS_FRESH, 0, DDH_STANDBY},
@@ -375,7 +377,7 @@ static const uint8_t DDH_TRANSITIONS[6][4] = {
 /* Target of the first transition that applies, or state. */
 static int32_t next_state(int32_t state, int32_t conditions)
 {
-    for (int32_t row = 0; row < 6; row++) {
+    for (int32_t row = 0; row < 7; row++) {
         int32_t when = (int32_t)DDH_TRANSITIONS[row][DDH_WHEN];
         int32_t unless = conditions & (int32_t)DDH_TRANSITIONS[row][DDH_UNLESS];
         if (((int32_t)DDH_TRANSITIONS[row][DDH_SOURCE] == state) && ((conditions & when) == when) && (unless ==
@@ -535,6 +537,30 @@ static void store(int32_t *state, int32_t index, int64_t value)
     } else {
         state[index] = sat32(value);
         state[DDH_ST_SATURATIONS] = sat32((int64_t)state[DDH_ST_SATURATIONS] + 1);
+    }
+}
+
+/* supervision: Supervision of the motion: a position that stays where it is while the motor is told to turn fast.
+ *
+ * Either the sensor is stuck or the rod is blocked; the controller would drive on in both cases.
+ */
+
+enum {
+    DDH_FAST = 6000, /* 0.25 rpm: half the drive's speed, more than any leak takes that a load is held against */
+    DDH_MOTION = 1000, /* um */
+    DDH_STUCK_PERIODS = 50,
+};
+
+/* Count the periods since the position (um) last moved by more than MOTION, or the motor was not fast. */
+static void watch_motion(int32_t *task, int32_t position)
+{
+    int64_t moved = absolute((int64_t)position - (int64_t)task[DDH_STILL_POSITION]);
+    if ((task[DDH_STATE] != DDH_RUN) || (moved > DDH_MOTION) || (absolute((int64_t)task[DDH_VELOCITY]) <
+            DDH_FAST)) {
+        task[DDH_STILL_POSITION] = position;
+        task[DDH_STILL_PERIODS] = 0;
+    } else {
+        task[DDH_STILL_PERIODS] = (int32_t)(task[DDH_STILL_PERIODS] + 1);
     }
 }
 
@@ -1412,6 +1438,9 @@ static int32_t conditions_of(const int32_t *mailboxes, int32_t *task)
     if ((mailboxes[DDH_STATUSWORD] & DDH_STATE_MASK) == DDH_OPERATION_ENABLED) {
         conditions = conditions | DDH_DRIVE_ENABLED;
     }
+    if (task[DDH_STILL_PERIODS] < DDH_STUCK_PERIODS) {
+        conditions = conditions | DDH_POSITION_MOVES;
+    }
     return conditions;
 }
 
@@ -1445,6 +1474,9 @@ static int32_t faults_of(const int32_t *mailboxes, const int32_t *task, int32_t 
     if (task[DDH_STATE] == DDH_SAFE) {
         if ((before == DDH_RUN) && ((statusword & DDH_STATE_MASK) != DDH_OPERATION_ENABLED)) {
             faults = faults | DDH_DRIVE_NOT_ENABLED;
+        }
+        if (task[DDH_STILL_PERIODS] >= DDH_STUCK_PERIODS) {
+            faults = faults | DDH_POSITION_STUCK;
         }
         faults = faults | task[DDH_FAULTS];
     }
@@ -1581,6 +1613,7 @@ static int32_t period(const int32_t *contract, int32_t *mailboxes, int32_t *task
         mailbox = mailbox + DDH_MAILBOX_SIZE;
         expected = expected + DDH_EXPECTATION_SIZE;
     }
+    watch_motion(task, mailboxes[DDH_FEEDBACK_POSITION]);
     int32_t conditions = conditions_of(mailboxes, task);
     int32_t before = task[DDH_STATE];
     task[DDH_STATE] = next_state(before, conditions);
@@ -1619,8 +1652,8 @@ static const int32_t DDH_CONTRACT[DDH_CONTRACT_SIZE] = {
     7, 20, 1, 0, 0, 1, 45, 48, 126, 190, 125, 10, 36, 86, 201, 105, 141, 175, 249, 226, 221, 23, 6, 1, 3, 1, 384,
     10, 30, 2, 16, 16, 0, 0, 65535, 32, 16, 1, -32768, 32767, 0, 0, 0, 0, 0, 12, 27, 77, 255, 78, 89, 180, 29, 183,
     189, 228, 18, 39, 51, 58, 235, 6, 1, 3, 1, 256, 6, 16, 16, 32, 16, 768, 8, 0, 4, 4, 3, 8, 1, 9, 1, 10, 1, 11, 1,
-    12, 1, 13, 1, 14, 1, 15, 1, 16, 1, 17, 1, 18, 1, 19, 1, 20, 1, 21, 1, 24, 8, 32, 16, 48, 16, 1536, 8, 0, 8, 16,
-    16, 32, 32, -1610678271, 8, 0, 8
+    12, 1, 13, 1, 14, 1, 15, 1, 16, 1, 17, 1, 18, 1, 19, 1, 20, 1, 21, 1, 22, 1, 24, 8, 32, 16, 48, 16, 1536, 8, 0,
+    8, 16, 16, 32, 32, -1610678271, 8, 0, 8
 };
 
 void ddh_start(ddh_controller *controller)

@@ -204,7 +204,7 @@ enum {
     DDH_MESSAGE_LENGTH = 1,
     DDH_MESSAGE_SIGNALS = 2,
     DDH_SIGNAL_SIZE = 2,
-    DDH_FAULT_COUNT = 14,
+    DDH_FAULT_COUNT = 15,
     DDH_DRIVE_COMMAND = 176,
     DDH_SENT_CONTROLWORD = 178,
     DDH_SENT_VELOCITY = 180,
@@ -212,16 +212,16 @@ enum {
     DDH_SENT_STATE = 184,
     DDH_SENT_LAW = 186,
     DDH_SENT_FAULTS = 188,
-    DDH_SENT_EXECUTION_TIME = 216,
-    DDH_SENT_SATURATIONS = 218,
-    DDH_SENT_OVERRUNS = 220,
-    DDH_OBSERVER_STATE = 222,
-    DDH_SENT_PAGE = 224,
-    DDH_SENT_CYCLE = 226,
-    DDH_SENT_VALUE = 228,
-    DDH_BENCH_CONTROL = 230,
-    DDH_BENCH_COMMAND = 232,
-    DDH_CONTRACT_SIZE = 234,
+    DDH_SENT_EXECUTION_TIME = 218,
+    DDH_SENT_SATURATIONS = 220,
+    DDH_SENT_OVERRUNS = 222,
+    DDH_OBSERVER_STATE = 224,
+    DDH_SENT_PAGE = 226,
+    DDH_SENT_CYCLE = 228,
+    DDH_SENT_VALUE = 230,
+    DDH_BENCH_CONTROL = 232,
+    DDH_BENCH_COMMAND = 234,
+    DDH_CONTRACT_SIZE = 236,
 };
 
 /* task */
@@ -241,7 +241,9 @@ enum {
     DDH_STATUS_PHASE = 12, /* periods since ControllerStatus */
     DDH_OBSERVER_PHASE = 13, /* periods modulo those of ObserverState */
     DDH_OBSERVER_PAGE = 14,
-    DDH_TASK_SIZE = 15,
+    DDH_STILL_POSITION = 15, /* where the position was when it last moved or the motor was slow, um */
+    DDH_STILL_PERIODS = 16, /* periods since then */
+    DDH_TASK_SIZE = 17,
 };
 
 /* fault bits, in the order of ControllerStatus */
@@ -260,6 +262,7 @@ enum {
     DDH_DRIVE_FAULT = 2048,
     DDH_CALIBRATION_INVALID = 4096,
     DDH_MAILBOX_OVERRUN = 8192,
+    DDH_POSITION_STUCK = 16384,
 };
 
 /* a frame to send */

@@ -17,14 +17,14 @@ from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING
-from firmware_py import task
+from firmware_py import supervision, task
 from firmware_py import task_layout as at
 from firmware_py.contract_words import contract_words
 from firmware_py.diagnosis import Fault, State
 from firmware_py.kernel import layout as k
-from firmware_py.kernel.layout import FLAG_SPEED_LIMITED, LAW_ADRC, LAW_PI
+from firmware_py.kernel.layout import FLAG_SPEED_LIMITED, LAW_ADRC, LAW_P, LAW_PI
 from firmware_py.node import EXECUTION_NS, Controller
-from firmware_py.tuning import Tuning
+from firmware_py.tuning import VELOCITY_LSB_RAD_S, PiTuning, Tuning
 
 CONTRACT = Contract.load()
 BLOCK = Tuning().calibration().to_bytes()
@@ -447,6 +447,60 @@ def test_the_safe_state_remembers_what_led_there(tripped):
     assert tripped.periods(500) == (QUICK_STOP, 0, State.SAFE, Fault.FEEDBACK_LOST)
 
 
+# a position that does not move
+
+
+def speed_up(rig: Rig, setpoint_0p1um: int = 3_000_000) -> Rig:
+    """Ask for a motion until the first command of at least 1500 rpm."""
+    set_inputs(rig, setpoint_0p1um=setpoint_0p1um)
+    for _ in range(100):
+        if abs(rig.period().target_velocity) >= supervision.FAST:
+            return rig
+    raise AssertionError("no fast command within 100 periods")
+
+
+@pytest.mark.parametrize("setpoint_0p1um", [0, 3_000_000])
+def test_a_position_that_stays_while_the_motor_turns_fast_is_stuck(running, setpoint_0p1um):
+    speed_up(running, setpoint_0p1um)
+    assert running.periods(49)[2:] == (State.RUN, 0)
+    assert running.period() == (QUICK_STOP, 0, State.SAFE, Fault.POSITION_STUCK)
+
+
+@pytest.mark.parametrize("moved_um", [1000, -1000])
+def test_a_millimetre_is_no_motion(running, moved_um):
+    speed_up(running).periods(48)
+    set_inputs(running, position_um=POSITION_UM + moved_um)
+    assert running.periods(2).faults == Fault.POSITION_STUCK
+
+
+@pytest.mark.parametrize("moved_um", [1001, -1001])
+def test_more_than_a_millimetre_shows_a_live_sensor(running, moved_um):
+    speed_up(running).periods(49)
+    set_inputs(running, position_um=POSITION_UM + moved_um)
+    assert running.periods(50).state == State.RUN
+    assert running.period().faults == Fault.POSITION_STUCK
+
+
+def test_a_motor_below_1500_rpm_may_turn_without_motion_for_long():
+    """A leak that a load is held against takes speed."""
+    error_m = 0.04
+    just_below = (supervision.FAST - 1) * VELOCITY_LSB_RAD_S / error_m
+    rig = Rig(Tuning(p=PiTuning(just_below)).calibration().to_bytes())
+    run(set_inputs(rig, law=LAW_P))
+    set_inputs(rig, setpoint_0p1um=10 * POSITION_UM + round(error_m * 1e7))
+    assert rig.periods(1000)[1:] == (supervision.FAST - 1, State.RUN, 0)
+
+
+def test_after_a_fault_reset_there_are_as_many_periods_again(running):
+    speed_up(running).periods(50)
+    set_inputs(running, setpoint_0p1um=10 * POSITION_UM, enable=0, fault_reset=1)
+    assert running.period().state == State.STANDBY
+    set_inputs(running, fault_reset=0)
+    speed_up(run(running))
+    assert running.periods(49).state == State.RUN
+    assert running.period().state == State.SAFE
+
+
 # and out of it
 
 
@@ -661,6 +715,9 @@ def test_each_fault_bit_has_its_signal(fault):
     set_inputs(rig, **causes.get(fault, {}))
     source, _, kind = fault.name.lower().rpartition("_")
     damage = {source: kind} if kind in ("lost", "corrupt") else {}
+    if fault == Fault.POSITION_STUCK:
+        set_inputs(rig, setpoint_0p1um=3_000_000)
+        rig.periods(200)
     if fault == Fault.MAILBOX_OVERRUN:
         rig.hear(rig.next_frame("setpoint"))
     for _ in range(4):
@@ -681,7 +738,8 @@ def test_limited_periods_are_counted(running):
     assert controller_status(running)["Saturations"] > 0
     running.periods(99)
     counted = controller_status(running)["Saturations"]
-    flags = running.controller.record.columns_by_name()["flags"]
+    record = running.controller.record.columns_by_name()
+    flags = record["flags"][record["state"] == State.RUN]  # the position stays: it does not run to the end
     assert counted == (flags & FLAG_SPEED_LIMITED).sum() > 1
 
 

@@ -11,12 +11,13 @@ from firmware_py.state_machine import (
     ENABLE,
     FAULT_RESET,
     INPUTS_FRESH,
+    POSITION_MOVES,
     next_state,
 )
 
-CONDITIONS = (CALIBRATED, INPUTS_FRESH, ENABLE, DRIVE_ENABLED, FAULT_RESET)
-ALL = CALIBRATED | INPUTS_FRESH | ENABLE | DRIVE_ENABLED | FAULT_RESET
-RUNNING = CALIBRATED | INPUTS_FRESH | ENABLE | DRIVE_ENABLED
+CONDITIONS = (CALIBRATED, INPUTS_FRESH, ENABLE, DRIVE_ENABLED, FAULT_RESET, POSITION_MOVES)
+RUNNING = CALIBRATED | INPUTS_FRESH | ENABLE | DRIVE_ENABLED | POSITION_MOVES
+ALL = RUNNING | FAULT_RESET
 
 
 @pytest.mark.parametrize(
@@ -27,6 +28,7 @@ RUNNING = CALIBRATED | INPUTS_FRESH | ENABLE | DRIVE_ENABLED
         (State.RUN, RUNNING & ~ENABLE, State.STANDBY),
         (State.RUN, RUNNING & ~INPUTS_FRESH, State.SAFE),
         (State.RUN, RUNNING & ~DRIVE_ENABLED, State.SAFE),
+        (State.RUN, RUNNING & ~POSITION_MOVES, State.SAFE),
         (State.SAFE, CALIBRATED | INPUTS_FRESH | FAULT_RESET, State.STANDBY),
     ],
 )
@@ -51,7 +53,7 @@ def test_what_a_state_waits_for(state, conditions):
 
 
 def test_lost_inputs_weigh_more_than_a_withdrawn_enable():
-    assert next_state(State.RUN, DRIVE_ENABLED) == State.SAFE
+    assert next_state(State.RUN, RUNNING & ~INPUTS_FRESH & ~ENABLE) == State.SAFE
 
 
 def test_run_is_entered_from_standby_only_and_power_on_never_again():
@@ -60,7 +62,8 @@ def test_run_is_entered_from_standby_only_and_power_on_never_again():
         target = next_state(state, conditions)
         if target == State.RUN:
             assert state in (State.STANDBY, State.RUN)
-            assert conditions & RUNNING & ~CALIBRATED == RUNNING & ~CALIBRATED
+            needed = RUNNING & ~CALIBRATED & ~(POSITION_MOVES if state == State.STANDBY else 0)
+            assert conditions & needed == needed
         if target == State.POWER_ON:
             assert state == State.POWER_ON
         if state == State.SAFE and target != State.SAFE:

@@ -26,7 +26,8 @@ RECEIVED = (
         ("MESSAGE_ID MESSAGE_LENGTH MESSAGE_SIGNALS", 0),
         (
             "STATE FAULTS DEFAULT_LAW ARMED RESET_ASKED SATURATIONS COMMAND_COUNTER CONTROLWORD VELOCITY"
-            " EXECUTION_TIME RESTART_ASKED CYCLE STATUS_PHASE OBSERVER_PHASE OBSERVER_PAGE TASK_SIZE",
+            " EXECUTION_TIME RESTART_ASKED CYCLE STATUS_PHASE OBSERVER_PHASE OBSERVER_PAGE STILL_POSITION"
+            " STILL_PERIODS TASK_SIZE",
             0,
         ),
         ("FRAME_ID FRAME_LENGTH FRAME_LOW FRAME_HIGH FRAME_SIZE", 0),
@@ -84,7 +85,7 @@ def test_what_is_expected_of_each_message_lies_where_it_is_looked_for():
                 "state": at.SENT_STATE,
                 "control_law": at.SENT_LAW,
                 "feedback_lost": at.SENT_FAULTS,
-                "mailbox_overrun": at.SENT_FAULTS + (at.FAULT_COUNT - 1) * at.SIGNAL_SIZE,
+                "position_stuck": at.SENT_FAULTS + (at.FAULT_COUNT - 1) * at.SIGNAL_SIZE,
                 "execution_time": at.SENT_EXECUTION_TIME,
                 "saturations": at.SENT_SATURATIONS,
                 "mailbox_overruns": at.SENT_OVERRUNS,

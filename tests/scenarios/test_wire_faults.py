@@ -1,9 +1,11 @@
 """Frames that are lost, corrupted, repeated or late."""
 
+import numpy as np
 import pytest
 from acceptance import MOTOR_LAG_S, PERIOD_S, reaction
 
 from firmware_py.diagnosis import State
+from hil.signals import Series
 from plant_sim.drive import State as Drive
 
 pytestmark = pytest.mark.needs("wire_faults")
@@ -117,3 +119,14 @@ def test_three_corrupt_mode_commands_are_reported(bench):
     bench.run(0.5)
     assert bench.controller_state == State.SAFE
     assert bench.controller_faults == {"CommandLost", "CommandCorrupt"}
+
+
+def test_a_stuck_sensor_stops_the_machine(moving):
+    moving.inject("sensor_stuck")
+    moving.run(1.0)
+    asked_rpm = Series(moving.trace["time_s"], np.abs(moving.trace["target_velocity_rpm"]))
+    fast_s = asked_rpm.time_s[asked_rpm.values >= 1500][0]
+    stop = reaction(moving, since_s=fast_s)
+    assert stop.safe_s == pytest.approx(50 * PERIOD_S, abs=0.5 * PERIOD_S)
+    assert moving.controller_faults == {"PositionStuck"}
+    assert moving.error_mm.between(0.5, fast_s + stop.at_rest_s).max < 20
