@@ -540,30 +540,6 @@ static void store(int32_t *state, int32_t index, int64_t value)
     }
 }
 
-/* supervision: Supervision of the motion: a position that stays where it is while the motor is told to turn fast.
- *
- * Either the sensor is stuck or the rod is blocked; the controller would drive on in both cases.
- */
-
-enum {
-    DDH_FAST = 6000, /* 0.25 rpm: half the drive's speed, more than any leak takes that a load is held against */
-    DDH_MOTION = 1000, /* um */
-    DDH_STUCK_PERIODS = 50,
-};
-
-/* Count the periods since the position (um) last moved by more than MOTION, or the motor was not fast. */
-static void watch_motion(int32_t *task, int32_t position)
-{
-    int64_t moved = absolute((int64_t)position - (int64_t)task[DDH_STILL_POSITION]);
-    if ((task[DDH_STATE] != DDH_RUN) || (moved > DDH_MOTION) || (absolute((int64_t)task[DDH_VELOCITY]) <
-            DDH_FAST)) {
-        task[DDH_STILL_POSITION] = position;
-        task[DDH_STILL_PERIODS] = 0;
-    } else {
-        task[DDH_STILL_PERIODS] = (int32_t)(task[DDH_STILL_PERIODS] + 1);
-    }
-}
-
 /* fal: Normalised fal: e within +-delta, else sign(e) delta (|e| / delta)^alpha.
  *
  * The normalised form is continuous with slope 1 in its linear zone. e and delta share one LSB, which is the
@@ -797,6 +773,30 @@ static int32_t law_of_block(const int32_t *block)
         return 0;
     }
     return law;
+}
+
+/* supervision: Supervision of the motion: a position that stays where it is while the motor is told to turn fast.
+ *
+ * Either the sensor is stuck or the rod is blocked; the controller would drive on in both cases.
+ */
+
+enum {
+    DDH_FAST = 6000, /* 0.25 rpm: half the drive's speed, more than any leak takes that a load is held against */
+    DDH_MOTION = 1000, /* um */
+    DDH_STUCK_PERIODS = 50,
+};
+
+/* Count the periods since the position (um) last moved by more than MOTION, or the motor was slow. */
+static void watch_motion(int32_t *task, int32_t position)
+{
+    int64_t moved = absolute((int64_t)position - (int64_t)task[DDH_STILL_POSITION]);
+    if ((task[DDH_STATE] != DDH_RUN) || (moved > DDH_MOTION) || (absolute((int64_t)task[DDH_VELOCITY]) <
+            DDH_FAST)) {
+        task[DDH_STILL_POSITION] = position;
+        task[DDH_STILL_PERIODS] = 0;
+    } else {
+        task[DDH_STILL_PERIODS] = (int32_t)(task[DDH_STILL_PERIODS] + 1);
+    }
 }
 
 /* eso: Extended state observer (eq. 26 with a linear zone): position, speed, acceleration, total disturbance. */
