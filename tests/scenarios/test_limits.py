@@ -36,10 +36,11 @@ def test_an_implausible_setpoint_is_not_followed(bench):
 
 
 @pytest.mark.bench(position_m=0.39)
-def test_pressing_against_the_end_stop_is_limited_by_the_relief_valve(bench):
+def test_pressing_against_the_end_stop_is_ended(bench):
     bench.setpoint(0.4005)
     bench.run(1.5)
-    assert bench.controller_state == State.RUN
+    assert bench.controller_state == State.SAFE
+    assert bench.controller_faults == {"PositionStuck"}
     assert bench.position_mm.values.max() < 401.0
     assert bench.trace["pressure_a_bar"].max() < 170.0
 
