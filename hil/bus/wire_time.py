@@ -180,6 +180,33 @@ def fd_bits(can_id, length, payload):  # type: ignore[no-untyped-def]
     return (nominal, fast) if switched else (nominal + fast, 0)
 
 
+def fd_worst_case_bits(can_id: int, length: int) -> tuple[int, int]:
+    """Return the length of the longest CAN FD frame with an identifier, as `fd_bits` does.
+
+    After a stuff bit four more of its level call for the next one, which nothing does sooner. When the first
+    one in the data comes depends on the bits before.
+
+    Parameters
+    ----------
+    can_id : int
+        Identifier with its flags; the transmitter may be error-passive or not.
+    length : int
+        Number of data bytes, one of `FD_LENGTHS`.
+    """
+    fours = np.arange(8 * length + 4) // 4 % 2
+    payloads = [
+        np.packbits(level ^ fours[begin : begin + 8 * length]).tobytes()
+        for level in (0, 1)
+        for begin in range(4)
+    ]
+    lengths: tuple[int, int] = max(
+        fd_bits(can_id | state, length, payload_words(int.from_bytes(payload, "little")))
+        for state in (0, ESI_FLAG)
+        for payload in payloads
+    )
+    return lengths
+
+
 def payload_words(data: int) -> NDArray[np.uint64]:
     """Return a payload of up to 64 bytes, byte 0 in its low eight bits, as 8 words."""
     return np.frombuffer(bytearray(data.to_bytes(64, "little")), np.uint64)

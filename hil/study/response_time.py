@@ -5,11 +5,13 @@ revisited and revised", Real-Time Systems 35 (2007), section 3: the earlier anal
 where a message's busy period spans several of its instances.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 
+from hil.bus.wire import DEFAULT_DATA_BIT_RATE
 from hil.bus.wire_core import arbitration_key
 
 NS_PER_S = 1_000_000_000
@@ -26,13 +28,15 @@ class Traffic:
     can_id : int
         Identifier, `dbc.frame.EFF_FLAG` set for a 29-bit one; the priority.
     bits : int
-        Longest frame, stuff bits and intermission included.
+        Longest frame, stuff bits and intermission included; of a CAN FD frame the part at the nominal rate.
     period_ns : int or None
         Shortest time between two instances; None if there is no such limit.
     jitter_ns : int
         Longest time from an instance's event to its frame being ready to send.
     deadline_ns : int or None
         Latest end of the frame after the event; None means the period, if there is one.
+    data_bits : int
+        The rest of a CAN FD frame, at the data bit rate.
     """
 
     name: str
@@ -41,6 +45,11 @@ class Traffic:
     period_ns: int | None
     jitter_ns: int = 0
     deadline_ns: int | None = None
+    data_bits: int = 0
+
+    def duration_ns(self, bit_rate: int, data_bit_rate: int) -> Fraction:
+        """Return how long the longest frame takes."""
+        return NS_PER_S * (Fraction(self.bits, bit_rate) + Fraction(self.data_bits, data_bit_rate))
 
     @property
     def due_ns(self) -> int | None:
@@ -80,13 +89,15 @@ class ResponseTime:
         return self.worst_ns is not None and self.worst_ns <= self.traffic.due_ns
 
 
-def load(messages: Iterable[Traffic], bit_rate: int) -> Fraction:
+def load(messages: Iterable[Traffic], bit_rate: int, data_bit_rate: int = DEFAULT_DATA_BIT_RATE) -> Fraction:
     """Return the share of bus time that the messages with a period take at most."""
-    shares = (Fraction(m.bits * NS_PER_S, m.period_ns * bit_rate) for m in messages if m.period_ns)
+    shares = (m.duration_ns(bit_rate, data_bit_rate) / m.period_ns for m in messages if m.period_ns)
     return sum(shares, Fraction(0))
 
 
-def response_times(messages: Iterable[Traffic], bit_rate: int) -> list[ResponseTime]:
+def response_times(
+    messages: Iterable[Traffic], bit_rate: int, data_bit_rate: int = DEFAULT_DATA_BIT_RATE
+) -> list[ResponseTime]:
     """Return the worst case of each message, in order of priority.
 
     A message without a period blocks those above it; below it, and for itself, there is no bound.
@@ -95,8 +106,8 @@ def response_times(messages: Iterable[Traffic], bit_rate: int) -> list[ResponseT
     ----------
     messages : iterable of Traffic
         All that is sent on the bus.
-    bit_rate : int
-        Bit/s.
+    bit_rate, data_bit_rate : int
+        Bit/s; the latter of CAN FD data.
 
     Raises
     ------
@@ -109,11 +120,11 @@ def response_times(messages: Iterable[Traffic], bit_rate: int) -> list[ResponseT
             raise ValueError(f"{message.name} and {following.name} have one identifier {message.can_id:#x}")
     if wrong := [message for message in ordered if message.period_ns is not None and message.period_ns <= 0]:
         raise ValueError(f"{wrong[0].name} has a period of {wrong[0].period_ns} ns, must be positive")
-    return [_worst_case(ordered, rank, bit_rate) for rank in range(len(ordered))]
+    return [_worst_case(ordered, rank, bit_rate, data_bit_rate) for rank in range(len(ordered))]
 
 
-def _worst_case(ordered: Sequence[Traffic], rank: int, bit_rate: int) -> ResponseTime:
-    durations = [-(-message.bits * NS_PER_S // bit_rate) for message in ordered]
+def _worst_case(ordered: Sequence[Traffic], rank: int, bit_rate: int, data_bit_rate: int) -> ResponseTime:
+    durations = [math.ceil(message.duration_ns(bit_rate, data_bit_rate)) for message in ordered]
     bit_ns = -(-NS_PER_S // bit_rate)
     this, duration_ns = ordered[rank], durations[rank]
     blocking_ns = max(durations[rank + 1 :], default=0)
@@ -122,7 +133,7 @@ def _worst_case(ordered: Sequence[Traffic], rank: int, bit_rate: int) -> Respons
         for message, cost_ns in zip(ordered[: rank + 1], durations, strict=False)
         if message.period_ns is not None
     ]
-    if len(competing) <= rank or load(ordered[: rank + 1], bit_rate) >= 1:
+    if len(competing) <= rank or load(ordered[: rank + 1], bit_rate, data_bit_rate) >= 1:
         return ResponseTime(this, duration_ns, blocking_ns, None, 0)
     period_ns, higher = competing[-1][0], competing[:-1]
 

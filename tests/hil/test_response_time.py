@@ -8,16 +8,23 @@ import numpy as np
 import pytest
 
 import dbc
-from dbc.frame import EFF_FLAG, Frame
+from dbc.frame import BRS_FLAG, EFF_FLAG, FD_FLAG, Frame
 from hil.bus.wire import Wire
 from hil.bus.wire_core import LOG_HEAD, LOG_TIME, arbitration_key
-from hil.bus.wire_time import INTERMISSION_BITS, classic_bits, worst_case_bits
+from hil.bus.wire_time import (
+    FD_LENGTHS,
+    INTERMISSION_BITS,
+    classic_bits,
+    fd_worst_case_bits,
+    worst_case_bits,
+)
 from hil.cli import main
 from hil.study.response_time import Traffic, load, response_times
 from hil.study.rta_command import traffic_of
 
 BIT_RATE = 125_000
 BIT_NS = 8000
+DATA_BIT_RATE = 2_000_000
 MS = 1_000_000
 
 
@@ -94,10 +101,43 @@ def test_the_longest_frame_is_that_of_the_literature(dlc):
     assert worst_case_bits(EFF_FLAG | 0x123, dlc) == 80 + 10 * dlc
 
 
+def most_stuff_bits(can_id: int, length: int) -> int:
+    """Return the most stuff bits of a CAN FD frame up to the end of its data, whatever its free bits are."""
+    switched = 1 if can_id & BRS_FLAG else 0
+    if can_id & EFF_FLAG:
+        head = f"0{can_id >> 18 & 0x7FF:011b}11{can_id & 0x3FFFF:018b}010{switched}"
+    else:
+        head = f"0{can_id & 0x7FF:011b}0010{switched}"
+    bits = head + "?" + f"{FD_LENGTHS.tolist().index(length):04b}" + "?" * (8 * length)  # ? ESI, data
+    most = {(0, "1"): 0}  # by length and level of the run of equal bits
+    for place, bit in enumerate(bits):
+        following: dict[tuple[int, str], int] = {}
+        for (run, level), count in most.items():
+            for now in "01" if bit == "?" else bit:
+                state, more = (run + 1 if now == level else 1, now), 0
+                if state[0] == 5 and place < len(bits) - 1:
+                    state, more = (1, "10"[int(now)]), 1
+                following[state] = max(following.get(state, 0), count + more)
+        most = following
+    return max(most.values())
+
+
+@pytest.mark.parametrize("length", FD_LENGTHS.tolist())
+@pytest.mark.parametrize("flags", [0, BRS_FLAG, EFF_FLAG, EFF_FLAG | BRS_FLAG])
+def test_the_longest_fd_frame_is_the_longest_of_all_there_are(flags, length):
+    rng = np.random.default_rng(11898)
+    without_stuff_bits = (36 if flags & EFF_FLAG else 17) + 5 + 8 * length + (27 if length <= 16 else 32) + 13
+    for base in (0, 0x7FF, *rng.integers(0x7FF, size=10).tolist()):
+        can_id = flags | (base << 18 | int(rng.integers(1 << 18)) if flags & EFF_FLAG else base)
+        nominal, fast = fd_worst_case_bits(can_id, length)
+        assert nominal + fast == without_stuff_bits + most_stuff_bits(can_id, length)
+        assert bool(fast) == bool(flags & BRS_FLAG)
+
+
 # the wire against the analysis
 
 
-def random_set(rng: np.random.Generator) -> tuple[int, list[tuple[Traffic, Frame]]]:
+def random_set(rng: np.random.Generator, fd: bool = False) -> tuple[int, list[tuple[Traffic, Frame]]]:
     """Return a bit rate and messages with a bound, each with the frame it always sends."""
     bit_rate = int(rng.choice([125_000, 250_000, 500_000, 1_000_000]))
     ids = rng.choice(0x7FF, size=int(rng.integers(2, 9)), replace=False).tolist()
@@ -105,13 +145,19 @@ def random_set(rng: np.random.Generator) -> tuple[int, list[tuple[Traffic, Frame
     messages = []
     for number, base in enumerate(ids):
         can_id = EFF_FLAG | base << 18 | int(rng.integers(1 << 18)) if rng.random() < 0.3 else base
-        dlc = int(rng.integers(9))
+        switched = BRS_FLAG if rng.random() < 0.7 else 0
+        flags = FD_FLAG | switched if fd and rng.random() < 0.6 else 0
+        dlc = int(rng.choice(FD_LENGTHS)) if flags else int(rng.integers(9))
         ones = (1 << 8 * dlc) - 1
-        data = (0, ones, int.from_bytes(rng.bytes(8)) & ones)[int(rng.integers(3))]
-        bits = worst_case_bits(can_id, dlc)
-        period_ns = round(bits * 1e9 / bit_rate * len(ids) / share * rng.uniform(0.5, 1.5))
+        data = (0, ones, int.from_bytes(rng.bytes(64)) & ones)[int(rng.integers(3))]
+        bits, data_bits = (
+            fd_worst_case_bits(can_id | flags, dlc) if flags else (worst_case_bits(can_id, dlc), 0)
+        )
+        longest_ns = bits * 1e9 / bit_rate + data_bits * 1e9 / DATA_BIT_RATE
+        period_ns = round(longest_ns * len(ids) / share * rng.uniform(0.5, 1.5))
         jitter_ns = int(rng.integers(period_ns // 2)) if rng.random() < 0.5 else 0
-        messages.append((Traffic(f"m{number}", can_id, bits, period_ns, jitter_ns), Frame(can_id, dlc, data)))
+        traffic = Traffic(f"m{number}", can_id, bits, period_ns, jitter_ns, data_bits=data_bits)
+        messages.append((traffic, Frame(can_id | flags, dlc, data)))
     return bit_rate, messages
 
 
@@ -120,13 +166,13 @@ def responses_ns(bit_rate: int, sent: list[tuple[int, int, Frame]], begin_ns: in
 
     A response ends with the frame's intermission, as in the analysis.
     """
-    wire = Wire(bit_rate)
+    wire = Wire(bit_rate, data_bit_rate=DATA_BIT_RATE)
     for sender, (_, ready_ns, frame) in enumerate(sent):
         wire.send(1000 + sender, ready_ns, frame)
     wire.run(1 << 61)
     events: dict[int, list[int]] = {}
     for event_ns, ready_ns, frame in sorted(sent, key=lambda entry: entry[1]):
-        events.setdefault(frame.can_id, []).append(event_ns)
+        events.setdefault(frame.can_id & 0xFFFF_FFFF, []).append(event_ns)
         assert ready_ns >= event_ns
     longest: dict[int, int] = {}
     assert len(wire.log) == len(sent)
@@ -137,11 +183,12 @@ def responses_ns(bit_rate: int, sent: list[tuple[int, int, Frame]], begin_ns: in
     return longest
 
 
-def test_no_frame_on_the_wire_takes_longer_than_its_bound():
+@pytest.mark.parametrize("fd", [False, True])
+def test_no_frame_on_the_wire_takes_longer_than_its_bound(fd):
     rng = np.random.default_rng(2007)
     tight = 0
     for _ in range(1000):
-        bit_rate, messages = random_set(rng)
+        bit_rate, messages = random_set(rng, fd)
         sent = []
         horizon_ns = 12 * max(traffic.period_ns for traffic, _ in messages)
         for traffic, frame in messages:
@@ -150,7 +197,7 @@ def test_no_frame_on_the_wire_takes_longer_than_its_bound():
                 late_ns = int(rng.integers(traffic.jitter_ns + 1))
                 sent.append((event_ns, event_ns + late_ns, frame))
         longest = responses_ns(bit_rate, sent)
-        for row in response_times([traffic for traffic, _ in messages], bit_rate):
+        for row in response_times([traffic for traffic, _ in messages], bit_rate, DATA_BIT_RATE):
             if row.worst_ns is None:
                 continue
             seen_ns = longest[row.traffic.can_id]
@@ -196,7 +243,7 @@ def test_the_wire_meets_the_analysis_at_the_critical_instant():
 
 
 def test_the_messages_are_those_of_the_dbc_with_a_cycle_time():
-    traffic, bit_rate = traffic_of(dbc.contract.PACKAGED_DBC)
+    traffic, bit_rate, _ = traffic_of(dbc.contract.PACKAGED_DBC)
     database = cantools.database.load_file(dbc.contract.PACKAGED_DBC)
     assert {t.name: t.period_ns for t in traffic} == {
         m.name: m.cycle_time * MS for m in database.messages if m.cycle_time
@@ -229,6 +276,38 @@ def test_the_figures_can_be_had_as_json(capsys):
     assert 0 < figures["load_percent"] < 50
 
 
+FD_DBC = """VERSION ""
+BU_: N
+BO_ 256 switched: 64 N
+
+BO_ 257 not_switched: 64 N
+
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","StandardCAN_FD";
+BA_DEF_ BO_ "CANFD_BRS" ENUM "0","1";
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ "BaudrateCANFD" INT 0 16000000;
+BA_DEF_DEF_ "GenMsgCycleTime" 10;
+BA_DEF_DEF_ "CANFD_BRS" "1";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN_FD";
+BA_ "BaudrateCANFD" 4000000;
+BA_ "CANFD_BRS" BO_ 257 0;
+"""
+
+
+def test_can_fd_messages_are_analysed_at_both_bit_rates(capsys, tmp_path):
+    path = tmp_path / "fd.dbc"
+    path.write_text(FD_DBC)
+    assert main(["rta", "--dbc", str(path), "-b", "500000", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)["500000"]
+    nominal, fast = fd_worst_case_bits(0x100 | BRS_FLAG, 64)
+    all_nominal, _ = fd_worst_case_bits(0x101, 64)
+    ends_ns = [nominal * 2000 + fast * 250 + all_nominal * 2000] * 2
+    assert [message["worst_ns"] for message in figures["messages"]] == ends_ns
+    assert figures["data_bit_rate"] == 4_000_000
+    assert main(["rta", "--dbc", str(path), "--data-bitrate", "8000000"]) == 0
+    assert "CAN FD data at 8000" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -236,7 +315,8 @@ def test_the_figures_can_be_had_as_json(capsys):
         (["--dbc", "nowhere.dbc"], "nowhere.dbc: cannot be read"),
         (["--dbc", "twins.dbc"], "twins.dbc: one and other have one identifier 0x100"),
         (["--dbc", "stopped.dbc"], "bit rate 0 is not from"),
-        (["--dbc", "fd.dbc"], "fd.dbc: one is no classic CAN frame: the analysis is for those, leave it out"),
+        (["--dbc", "long.dbc"], "long.dbc: one has more than 8 bytes: no frame, leave it out"),
+        (["--dbc", "fd.dbc", "--data-bitrate", "9"], "CAN FD data bit rate 9 is not from 1000000"),
         (["--jitter", "-1"], "--jitter is -1.0, must be from 0"),
     ],
 )
@@ -247,8 +327,8 @@ def test_wrong_input_is_refused_with_one_line(capsys, tmp_path, monkeypatch, arg
     (tmp_path / "twins.dbc").write_text(f'VERSION ""\nBU_: N\n{frames}{cycle}')
     stopped = 'BA_DEF_ "Baudrate" INT 0 1000000;\nBA_DEF_DEF_ "Baudrate" 0;\nBA_ "Baudrate" 0;\n'
     (tmp_path / "stopped.dbc").write_text(f'VERSION ""\nBU_: N\nBO_ 256 one: 8 N\n\n{cycle}{stopped}')
-    fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","StandardCAN_FD";\nBA_ "VFrameFormat" BO_ 256 1;\n'
-    (tmp_path / "fd.dbc").write_text(f'VERSION ""\nBU_: N\nBO_ 256 one: 8 N\n\n{cycle}{fd}')
+    (tmp_path / "long.dbc").write_text(f'VERSION ""\nBU_: N\nBO_ 256 one: 64 N\n\n{cycle}')
+    (tmp_path / "fd.dbc").write_text(FD_DBC)
     assert main(["rta", *arguments]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
