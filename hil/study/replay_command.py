@@ -31,8 +31,8 @@ COUNTS = {
     "only_computed": "only computed",
     "only_recorded": "only in the log",
 }
-EXIT_CODES = """exit codes: 0 all that is in the log is computed again; 1 something differs, or the log
-ends early; 2 wrong input"""
+EXIT_CODES = """exit codes: 0 all that is in the log is computed again; 1 something differs, or
+the log ends early; 2 wrong input"""
 
 
 def add_command(commands: Any) -> None:

@@ -32,8 +32,8 @@ def add_command(commands: Any) -> None:
         "sweep",
         help="play scenarios on many machines of a box",
         usage="hil sweep SCENARIO... [options]   (names as in `hil list`, or .toml)",
-        epilog="exit codes: 0 no more samples failed than may; 1 more; 2 wrong input or no answer;\n"
-        "3 a process was lost; 130 interrupted",
+        epilog="exit codes: 0 no more samples failed than may; 1 more; 2 wrong input or no\n"
+        "answer; 3 a process was lost; 130 interrupted",
         formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=40),
     )
     sweep.set_defaults(command=run_command)
