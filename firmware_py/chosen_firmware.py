@@ -16,7 +16,6 @@ PYTHON = "python"
 PROCESSORS = tuple(TARGETS)
 FIRMWARES = (PYTHON, *PROCESSORS)
 FIGURES = "clock_mhz", "execution_us"
-HELP = f"one of {', '.join(FIRMWARES)}; {' and '.join(f'{figure}=NUMBER' for figure in FIGURES)} may follow"
 COST = Path(__file__).parent / "emulated" / "cost.json"
 
 
@@ -143,4 +142,4 @@ def firmware_of_text(text: str) -> ChosenFirmware:
 
 def add_firmware_argument(parser: argparse.ArgumentParser) -> None:
     """Add --firmware; `firmware_of_text` makes it a firmware."""
-    parser.add_argument("--firmware", default=PYTHON, metavar="NAME,K=V", help=HELP)
+    parser.add_argument("--firmware", default=PYTHON, metavar="NAME,K=V", help=" ".join(FIRMWARES))
