@@ -47,6 +47,9 @@ elf: $(READY)  ## rebuild the images of the processors from firmware_py/c and fi
 	$(BIN)/python -m firmware_py.emulated.build
 
 cost: $(READY)  ## measure what the images cost; rewrite the figures in README and docs/silicon.md
+	command -v arm-none-eabi-gcc >/dev/null || apt-get install --yes --quiet gcc-arm-none-eabi
+	command -v riscv64-unknown-elf-gcc >/dev/null || apt-get install --yes --quiet gcc-riscv64-unknown-elf
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[arm]'
 	$(BIN)/hil cost --write
 	$(BIN)/python tests/tools/cost_figures.py
 

@@ -108,8 +108,12 @@ class RealtimeRig(Rig):
             Naming the one that has gone silent.
         """
         longest_s = max(_SILENT_PERIODS * PERIOD_NS / 1e9 / float(self.options.rt_ratio), _SILENT_S)
-        for side, can_id in self._beacons.items():
-            silent_s = (time.monotonic_ns() - self.listener.newest_ns[can_id]) / 1e9
+        heard_ns = self.listener.newest_ns
+        last_ns = {side: heard_ns[can_id] for side, can_id in self._beacons.items()}
+        # a sensor may be silent while its plant runs
+        last_ns["plant"] = max(last_ns["plant"], heard_ns[self.contract.drive_status.can_id])
+        for side, newest_ns in last_ns.items():
+            silent_s = (time.monotonic_ns() - newest_ns) / 1e9
             if silent_s > longest_s:
                 raise BenchError(f"the {side} has been silent for {silent_s:.1f} s: does it still run?")
 

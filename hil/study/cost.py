@@ -2,14 +2,14 @@
 
 import itertools
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from firmware_py.calibration import Calibration
-from firmware_py.emulated.build import BuildError, build, compiler_version
+from firmware_py.emulated.build import build, compiler_version
 from firmware_py.emulated.cycles import Cost
 from firmware_py.emulated.image import MANIFEST, Image, reference_image
 from firmware_py.emulated.machine import Machine
@@ -143,16 +143,27 @@ def bill(periods: int, progress: Callable[[str], None]) -> dict[str, Any]:
     return {"compiler": manifest["compiler"], "periods": periods, "processors": processors}
 
 
-def compilers_bill(periods: int, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Return what ADRC costs as built by each compiler that is installed; see `bill` for the parameters."""
+def compiler_names() -> dict[tuple[str, str, str], str]:
+    """Return name, version and option of each compiler, by compiler, option and processor.
+
+    Raises
+    ------
+    BuildError
+        If one is not installed.
+    """
+    return {
+        (compiler, optimisation, processor): f"{compiler_version(compiler, processor)} {optimisation}"
+        for (compiler, optimisation), processor in itertools.product(BUILDS, TARGETS)
+    }
+
+
+def compilers_bill(
+    names: Mapping[tuple[str, str, str], str], periods: int, progress: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return what ADRC costs as built by each compiler; see `compiler_names`, and `bill` for the others."""
     sine, jumps = sine_inputs("ADRC", periods), jump_inputs()
     built: dict[str, Any] = {}
-    for (compiler, optimisation), processor in itertools.product(BUILDS, TARGETS):
-        try:
-            name = f"{compiler_version(compiler, processor)} {optimisation}"
-        except BuildError as error:
-            progress(f"{processor}, {compiler} left out: {error}")
-            continue
+    for (compiler, optimisation, processor), name in names.items():
         progress(f"{processor}, {name}")
         image = build(compiler, processor, optimisation)
         built.setdefault(name, {})[processor] = {

@@ -1,4 +1,4 @@
-"""Play the fault matrix and write its tables into ``docs/fault_matrix.md`` (``make faults``)."""
+"""Play the faults and write their tables into ``docs/fault_matrix.md`` (``make faults``)."""
 
 import json
 import sys
@@ -6,6 +6,7 @@ import sys
 from readme_figures import ROOT, write_to_page
 
 from hil import cli
+from hil.study import stuck_sensor
 from hil.study.fault_pages import markdown
 from hil.study.faults_command import EXIT_OK, EXIT_UNEXPECTED
 
@@ -20,6 +21,7 @@ def main() -> int:
         return code
     matrix = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
     write_to_page("matrix", markdown(matrix), PAGE)
+    write_to_page("stuck", stuck_sensor.markdown(), PAGE)
     return code
 
 

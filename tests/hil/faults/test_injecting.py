@@ -3,11 +3,13 @@
 import json
 import signal
 import socket
+import time
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -29,7 +31,7 @@ from hil.faults.fault import FaultError
 from hil.inject_command import take_faults
 from hil.run.inprocess import InprocessRig, run_inprocess
 from hil.run.lockstep import run_lockstep
-from hil.run.options import Recording, RigOptions, RunOptions
+from hil.run.options import BenchError, Recording, RigOptions, RunOptions
 from hil.run.realtime_rig import RealtimeRig
 from hil.scenario import Scenario, ScenarioError, load_scenario
 
@@ -180,6 +182,18 @@ def test_in_real_time_sensor_and_load_do_what_they_are_told(tmp_path):
         loads = [CONTRACT.bench_load.unpack(int(data)).force for data in sent_on(bench, "BenchLoad")]
         assert loads[-1] == -700
         assert [fault["kind"] for fault in bench.result("x")["faults"]] == ["sensor_bias", "load_step"]
+
+
+def test_a_plant_whose_sensor_is_silent_still_runs(tmp_path):
+    rig = RealtimeRig(RigOptions(record_directory=tmp_path))
+    now_ns = time.monotonic_ns()
+    heard_ns = {CONTRACT.position_feedback.can_id: now_ns - 10**11, CONTRACT.drive_status.can_id: now_ns}
+    rig.listener = SimpleNamespace(newest_ns=heard_ns | {CONTRACT.drive_command.can_id: now_ns})
+    rig.check_sides()
+    heard_ns = dict.fromkeys(rig.listener.newest_ns, now_ns - 10**11)
+    rig.listener = SimpleNamespace(newest_ns=heard_ns | {CONTRACT.drive_command.can_id: now_ns})
+    with pytest.raises(BenchError, match="the plant has been silent for 100"):
+        rig.check_sides()
 
 
 def sent_on(bench: Bench, message: str) -> list[int]:

@@ -6,6 +6,7 @@ import pytest
 
 from dbc.node import PERIOD_NS
 from firmware_py.chosen_firmware import COST
+from firmware_py.emulated.build import BuildError
 from firmware_py.emulated.image import MANIFEST, reference_image
 from firmware_py.emulated.meter import Meter
 from firmware_py.emulated.processors import TARGETS
@@ -79,3 +80,14 @@ def test_what_makes_no_sense_is_refused_in_one_line(capsys, arguments, said):
 
 def test_all_of_the_sine_is_the_most_that_is_measured():
     assert load_scenario(SCENARIO).periods == MOST_PERIODS
+
+
+def test_nothing_is_written_where_a_compiler_is_missing(monkeypatch, capsys):
+    def missing(compiler, processor):
+        raise BuildError(f"{compiler} for {processor} is not installed")
+
+    monkeypatch.setattr("hil.study.cost.compiler_version", missing)
+    before = COST.read_bytes()
+    assert cli.main(["cost", "--write"]) == 2
+    assert capsys.readouterr().err == "hil: zig for cortex-m0plus is not installed\n"
+    assert COST.read_bytes() == before

@@ -15,6 +15,7 @@ from hil.bench import Bench
 from hil.faults.catalogue import KINDS
 from hil.run.inprocess import InprocessRig
 from hil.run.options import RigOptions
+from hil.study import stuck_sensor
 from hil.study.fault_matrix import PHASES, Detector, Expectation, MatrixError, Reaction, load_matrix
 from hil.study.fault_pages import markdown, page
 from hil.study.fault_runs import Played, matrix_of, play_case, play_matrix
@@ -94,6 +95,11 @@ def test_the_page_shows_what_was_played(played):
     assert NUMBER.sub("#", ours) == NUMBER.sub("#", shown), "run `make faults`"
     theirs = [float(number) for number in NUMBER.findall(shown)]
     assert [float(number) for number in NUMBER.findall(ours)] == pytest.approx(theirs, rel=0.02, abs=0.11)
+
+
+def test_the_page_shows_how_late_a_stuck_sensor_is_found():
+    shown = DOCS.read_text(encoding="utf-8").split("<!-- stuck: begin -->\n")[1]
+    assert shown.split("<!-- stuck: end -->")[0] == stuck_sensor.markdown(), "run `make faults`"
 
 
 def test_the_report_holds_every_case_and_needs_nothing_else(played):
