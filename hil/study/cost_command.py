@@ -131,7 +131,7 @@ def _tables(figures: dict[str, Any], clock_mhz: float | None) -> Iterator[Table]
         columns = list(zip(*bill, strict=True))[1:]
         for number, (heading, column) in enumerate(zip(HEADINGS[1:], columns, strict=True)):
             longest = max(len(word) for word in " ".join((heading, *column)).split())  # a figure is never cut
-            table.add_column(heading, justify="right" if number else "left", min_width=longest)
+            table.add_column(heading, justify="right" if number else "left", width=longest)
         for row in zip(*columns, strict=True):
             table.add_row(*row)
         yield table
