@@ -40,6 +40,8 @@ class Contract:
         Nominal bit rate, bit/s.
     messages : tuple of MessageCodec
         In order of priority: 11-bit identifiers first, each kind ascending.
+    bench_channel_ids : frozenset of int
+        Identifiers of the messages on the bench channel: out of band.
     """
 
     def __init__(self, path: Path, database: "Database") -> None:
@@ -59,6 +61,7 @@ class Contract:
         codecs = [value for value in vars(self).values() if isinstance(value, MessageCodec)]
         codecs.sort(key=lambda codec: codec.can_id)
         self.messages: tuple[MessageCodec[..., Any], ...] = tuple(codecs)
+        self.bench_channel_ids = frozenset(codec.can_id for codec in codecs if codec.bench_channel)
 
     def message(self, name: str) -> MessageCodec[..., Any]:
         """Return a message by its name in the DBC.

@@ -8,8 +8,8 @@ from firmware_py.kernel.fixedpoint import absolute
 from firmware_py.state_machine import RUN
 from firmware_py.task_layout import STATE, STILL_PERIODS, STILL_POSITION, VELOCITY
 
-FAST = 6000  # 0.25 rpm: half the drive's speed, more than any leak takes that a load is held against
-MOTION = 1000  # um
+FAST = 6000  # in 0.25 rpm; half the drive's speed: holding a load against the pumps' leaks takes less
+MOTION = 1000  # in um
 STUCK_PERIODS = 50
 
 

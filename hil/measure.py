@@ -254,8 +254,7 @@ def bus_load_of_windows(recording: Recording, contract: Contract, bit_rate: int,
 
 def _carried(recording: Recording, contract: Contract, bit_rate: int) -> tuple[np.ndarray, np.ndarray]:
     """Return ends (bus time, ns) and lengths (bits at `bit_rate`) of all frames but the bench channel's."""
-    bench = {message.can_id for message in contract.messages if message.bench_channel}
-    carried = recording.traffic[~np.isin(recording.traffic[:, 1], list(bench))]
+    carried = recording.traffic[~np.isin(recording.traffic[:, 1], list(contract.bench_channel_ids))]
     nominal, fast = traffic_bits(carried).T
     return carried[:, 0], nominal + fast * (bit_rate / recording.data_bit_rate)
 

@@ -87,6 +87,7 @@ class Supervisor:
         self._command = contract.controller_command
         self._bench_control = contract.bench_control
         self._bench_load = contract.bench_load
+        self._bench_channel_ids = contract.bench_channel_ids
         counter, layout = np.zeros(1, np.int64), self._setpoint.protected_layout()
         self._protect_setpoint = partial(_protect, counter, layout[:CONFIGURATION_SIZE])
         setpoint_head = self._setpoint.can_id | self._setpoint.dlc << HEAD_DLC
@@ -204,8 +205,7 @@ class Supervisor:
             frames.append(self._command_frame())
         if loaded:
             frames.append(self._bench_load.frame(self._bench_load.pack(self._load_n)))
-        bench_channel = (self._bench_control.can_id, self._bench_load.can_id)
-        self.bench_frames += [frame for frame in frames if frame.can_id in bench_channel]
+        self.bench_frames += [frame for frame in frames if frame.can_id in self._bench_channel_ids]
         return frames
 
     def _position_in(self, period: int) -> tuple[float, int]:

@@ -781,8 +781,8 @@ static int32_t law_of_block(const int32_t *block)
  */
 
 enum {
-    DDH_FAST = 6000, /* 0.25 rpm: half the drive's speed, more than any leak takes that a load is held against */
-    DDH_MOTION = 1000, /* um */
+    DDH_FAST = 6000, /* in 0.25 rpm; half the drive's speed: holding a load against the pumps' leaks takes less */
+    DDH_MOTION = 1000, /* in um */
     DDH_STUCK_PERIODS = 50,
 };
 

@@ -183,5 +183,4 @@ def make_wire(contract: Contract, bit_rate: int, data_bit_rate: int = DEFAULT_DA
     """Return a wire on which the contract's bench channel is out of band."""
     check_bit_rate(bit_rate)
     check_data_bit_rate(data_bit_rate, bit_rate)
-    out_of_band = frozenset(message.can_id for message in contract.messages if message.bench_channel)
-    return Wire(bit_rate, out_of_band, data_bit_rate)
+    return Wire(bit_rate, contract.bench_channel_ids, data_bit_rate)

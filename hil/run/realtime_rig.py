@@ -289,8 +289,7 @@ class RealtimeSession:
 
     def _injections(self, traffic: np.ndarray) -> list[tuple[float, int, int, int]]:
         """Return the frames on the bench channel that are not the supervisor's, their times in s."""
-        contract = self._rig.contract
-        bench_channel = (contract.bench_control.can_id, contract.bench_load.can_id)
+        bench_channel = list(self._rig.contract.bench_channel_ids)
         own, found = Counter(map(tuple, self.supervisor.bench_frames)), []
         for time_ns, *frame in traffic[np.isin(traffic[:, 1], bench_channel)].tolist():
             if own[tuple(frame)]:

@@ -71,7 +71,7 @@ def grouped(matrix: Mapping[str, Any]) -> dict[str, dict[str, list[dict[str, Any
 
 
 def noticed(cases: Sequence[Mapping[str, Any]]) -> str:
-    """Return who notices a fault outside of standby, when at the latest, and when at the latest it should."""
+    """Return who notices a fault in the first phase but standby, when at the latest, and when it should."""
     running = [case for case in cases if case["phase"] != "standby"] or cases
     by = running[0]["measured"]["by"]
     if by == Detector.NOBODY:
@@ -81,7 +81,7 @@ def noticed(cases: Sequence[Mapping[str, Any]]) -> str:
 
 
 def reaction(cases: Sequence[Mapping[str, Any]]) -> str:
-    """Return the reaction that is expected, in words."""
+    """Return the reaction that is expected in the first phase but standby, in words."""
     running = [case for case in cases if case["phase"] != "standby"]
     if not running:
         return "nothing moves"

@@ -238,8 +238,7 @@ def _course(bench: Bench) -> dict[str, np.ndarray]:
 
 def _in_band(bench: Bench) -> np.ndarray:
     traffic = bench.recording.traffic
-    bench_channel = [message.can_id for message in bench.contract.messages if message.bench_channel]
-    return traffic[~np.isin(traffic[:, 1], bench_channel)]
+    return traffic[~np.isin(traffic[:, 1], list(bench.contract.bench_channel_ids))]
 
 
 def _noticed(

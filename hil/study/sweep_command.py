@@ -47,7 +47,7 @@ def add_command(commands: Any) -> None:
     sweep.add_argument("--box", type=Path, metavar="FILE", help="another box than hil/study/box.toml")
     sweep.add_argument("--controller", choices=CONTROLLERS, metavar="LAW", help="default: the tuning's own")
     add_tuning_arguments(sweep)
-    sweep.add_argument("--duration", type=float, metavar="S", help="cut the scenarios short, s")
+    sweep.add_argument("--duration", type=float, metavar="S", help="other length than the scenarios', s")
     sweep.add_argument(
         "--max-failures", type=int, default=0, metavar="N", help="samples that may fail (default 0)"
     )

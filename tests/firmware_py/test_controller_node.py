@@ -17,7 +17,7 @@ from dbc.contract import PACKAGED_DBC, Contract
 from dbc.frame import Frame
 from dbc.messages import BenchCommand
 from dbc.node import NOTHING
-from firmware_py import supervision, task
+from firmware_py import task
 from firmware_py import task_layout as at
 from firmware_py.contract_words import contract_words
 from firmware_py.diagnosis import Fault, State
@@ -454,7 +454,7 @@ def speed_up(rig: Rig, setpoint_0p1um: int = 3_000_000) -> Rig:
     """Ask for a motion until the first command of at least 1500 rpm."""
     set_inputs(rig, setpoint_0p1um=setpoint_0p1um)
     for _ in range(100):
-        if abs(rig.period().target_velocity) >= supervision.FAST:
+        if abs(rig.period().target_velocity) >= 4 * 1500:
             return rig
     raise AssertionError("no fast command within 100 periods")
 
@@ -481,14 +481,24 @@ def test_more_than_a_millimetre_shows_a_live_sensor(running, moved_um):
     assert running.period().faults == Fault.POSITION_STUCK
 
 
-def test_a_motor_below_1500_rpm_may_turn_without_motion_for_long():
-    """A leak that a load is held against takes speed."""
+def asked_to_turn(speed_rpm: float) -> Rig:
+    """A controller that has just begun to command this speed, and goes on."""
     error_m = 0.04
-    just_below = (supervision.FAST - 1) * VELOCITY_LSB_RAD_S / error_m
-    rig = Rig(Tuning(p=PiTuning(just_below)).calibration().to_bytes())
+    rig = Rig(Tuning(p=PiTuning(4 * speed_rpm * VELOCITY_LSB_RAD_S / error_m)).calibration().to_bytes())
     run(set_inputs(rig, law=LAW_P))
     set_inputs(rig, setpoint_0p1um=10 * POSITION_UM + round(error_m * 1e7))
-    assert rig.periods(1000)[1:] == (supervision.FAST - 1, State.RUN, 0)
+    while rig.period().target_velocity != 4 * speed_rpm:
+        assert len(rig.outputs) < 1000
+    return rig
+
+
+def test_a_motor_below_1500_rpm_may_turn_without_motion_for_long():
+    """A leak that a load is held against takes speed."""
+    assert asked_to_turn(1499.75).periods(1000)[2:] == (State.RUN, 0)
+
+
+def test_a_motor_at_1500_rpm_may_not():
+    assert asked_to_turn(1500.0).periods(50)[2:] == (State.SAFE, Fault.POSITION_STUCK)
 
 
 def test_after_a_fault_reset_there_are_as_many_periods_again(running):

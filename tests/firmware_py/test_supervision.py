@@ -29,7 +29,7 @@ def longest_standstill(position_um, velocity):
     return longest
 
 
-def test_no_machine_of_the_box_is_taken_for_stuck():
+def test_under_the_robust_tuning_no_machine_of_the_box_is_taken_for_stuck():
     """Under the scenario that comes nearest: on the worst machine its load holds the rod for 27 periods."""
     scenario, calibration = load_scenario("lift_lower_load"), TUNINGS["robust"].calibration()
     for machine in MACHINES:
