@@ -28,7 +28,7 @@ from hil.bus.socketcan import socketcan_status
 from hil.bus.wire import DEFAULT_DATA_BIT_RATE, Wire
 from hil.faults.catalogue import fault_of_text, rows
 from hil.faults.fault import FaultError
-from hil.measure import METRICS, result_of, trace_of
+from hil.measure import METRICS, overrun_of, result_of, trace_of
 from hil.picture import heading
 from hil.progress import progress_bar
 from hil.report import OutputDirectory
@@ -273,6 +273,8 @@ def _run(arguments: argparse.Namespace) -> int:
             f"hil: not judged: {scenario.name} has limits for {judged}, none for {result['controller']}",
             file=sys.stderr,
         )
+    if overrun := overrun_of(result):
+        print(f"hil: {overrun}", file=sys.stderr)
     if recording.ending or result["verdict"]:
         print(f"hil: {recording.ending or result['verdict']}", file=sys.stderr)
     if recording.broken:

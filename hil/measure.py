@@ -232,6 +232,17 @@ def left_run(trace: Trace) -> str:
     )
 
 
+def overrun_of(result: dict[str, Any]) -> str:
+    """Say of how many periods of a real-time run the machine was too late, or nothing."""
+    missed, late = (result["timing"][count] for count in ("missed_periods", "late_periods"))
+    if result["mode"] != "realtime" or not missed + late:
+        return ""
+    return (
+        f"{missed} of {result['timing']['periods']} periods missed, {late} late: this machine or its bus did "
+        f"not keep up; try --rt-ratio below {result['notes']['rt_ratio']:g}"
+    )
+
+
 def bus_load_percent(recording: Recording, contract: Contract, bit_rate: int) -> float:
     """Return the share of bus time that the frames take at `bit_rate`, the bench channel left out."""
     _, bits = _carried(recording, contract, bit_rate)

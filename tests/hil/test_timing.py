@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from dbc.contract import Contract
 from firmware_py.node import EXECUTION_NS
 from hil import cli
-from hil.measure import result_of, timing_in
-from hil.run.options import RunOptions
+from hil.measure import overrun_of, result_of, timing_in
+from hil.run.options import Recording, RunOptions
 from hil.scenario import ScenarioError, TimingLimits, load_scenario
 from hil.signals import NothingKnownError
 from hil.timing import INFERRED, RECORDED, Timing, timing_of
@@ -528,6 +528,22 @@ def test_a_broken_timing_alone_misses_the_limits():
     assert verdict.startswith(
         "timing limits were broken once, first in period 1234 (1.234 s): number of missed periods 1 is "
     )
+
+
+def test_a_real_time_run_that_the_machine_did_not_keep_up_with_is_told():
+    recording = replace(played("sine").recording, notes={"rt_ratio": 0.5})
+    commands = np.flatnonzero(recording.traffic[:, 1] == COMMAND)
+    behind = replace(recording, traffic=np.delete(recording.traffic, commands[1334], axis=0))
+    options = RunOptions(load_scenario("sine"), "adrc", record_directory=Path())
+
+    def told(recording: Recording, mode: str) -> str:
+        return overrun_of(result_of(recording, played("sine").trace, CONTRACT, options, mode))
+
+    assert told(behind, "realtime") == (
+        "1 of 9999 periods missed, 0 late: this machine or its bus did not keep up; try --rt-ratio below 0.5"
+    )
+    assert told(recording, "realtime") == ""
+    assert told(behind, "lockstep") == ""
 
 
 def test_a_run_that_was_cut_short_is_not_judged():
