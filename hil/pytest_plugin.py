@@ -154,8 +154,9 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         return
     passed = sum("bench" in dict(report.user_properties) for report in terminalreporter.getreports("passed"))
     why = ", ".join(f"{count} need {what}" for what, count in sorted(lacking.items())) or "none"
+    scenarios = "scenario" if applicable == 1 else "scenarios"
     terminalreporter.write_line(
-        f"hil: {applicable} scenarios on {interface_of(config)}, {passed} passed; "
+        f"hil: {applicable} {scenarios} on {interface_of(config)}, {passed} passed; "
         f"{sum(lacking.values())} not applicable ({why})"
     )
 

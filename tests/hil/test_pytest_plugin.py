@@ -247,7 +247,7 @@ def test_what_the_interface_lacks_is_not_applicable_and_counted(tmp_path):
 
 def test_only_what_was_selected_is_counted(tmp_path):
     selected = user_session(tmp_path, USER_TESTS, "--hil-mode=realtime", "--collect-only", "-k", "passes")
-    assert "hil: 1 scenarios on hilbus, 0 passed; 0 not applicable (none)" in selected.lines
+    assert "hil: 1 scenario on hilbus, 0 passed; 0 not applicable (none)" in selected.lines
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from hand_started import CHANNEL, RT_RATIO, Side, both_sides
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
-SUMMARY = re.compile(r"^hil: (\d+) scenarios on socketcan, (\d+) passed; .*$", re.MULTILINE)
+SUMMARY = re.compile(r"^hil: (\d+) scenarios? on socketcan, (\d+) passed; .*$", re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
