@@ -117,7 +117,7 @@ def require_emulator(what: str) -> None:
         If it is not installed.
     """
     if importlib.util.find_spec("unicorn") is None or importlib.util.find_spec("elftools") is None:
-        raise FirmwareError(f"{what} needs the emulator: pip install 'ddh-hil[pil]'")
+        raise FirmwareError(f"{what} needs the emulator: pip install '.[pil]' in the project's folder")
 
 
 def firmware_of_text(text: str) -> ChosenFirmware:

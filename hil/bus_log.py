@@ -30,7 +30,7 @@ _BLF_FILE_SIZE = 10
 _EVERY_CHANNEL = ""
 """Of error frames, as candump's reader does not tell theirs."""
 
-MF4_EXTRA = ".mf4 needs asammdf: pip install 'ddh-hil[mf4]'"
+MF4_EXTRA = ".mf4 needs asammdf: pip install '.[mf4]' in the project's folder"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -314,7 +314,7 @@ def test_a_log_format_whose_package_is_missing_is_refused_before_the_run(out, co
         timeout=SAFETY_NET_S,
     )
     assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr == "hil: .mf4 needs asammdf: pip install 'ddh-hil[mf4]'\n"
+    assert refused.stderr == "hil: .mf4 needs asammdf: pip install '.[mf4]' in the project's folder\n"
     assert not out.exists()
 
 
