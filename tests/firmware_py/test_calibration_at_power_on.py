@@ -1,7 +1,9 @@
 """With a damaged calibration flashed, the firmware moves nothing, whatever it is compiled to."""
 
 import random
+import re
 import struct
+from pathlib import Path
 from types import ModuleType
 
 import numba
@@ -158,3 +160,29 @@ def test_an_image_holds_the_block_as_flashed(processor):
     flash = {address + n: byte for address, data in image.segments for n, byte in enumerate(data)}
     block = bytes(flash[begin + n] for n in range(BLOCK_BYTES))
     assert block == chosen_tuning().calibration.to_bytes()
+
+
+def test_the_damaged_block_in_the_documentation_is_refused(capsys):
+    page = (Path(__file__).parents[2] / "docs/silicon.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(example, "docs/silicon.md", "exec"), {})
+    assert capsys.readouterr().out.count("Frame(") == 2
+
+
+SWITCH_ON_DISABLED, FAULT = 0x250, 0x218
+
+
+@pytest.mark.parametrize(
+    ("statusword", "fault_reset", "controlword"),
+    [(SWITCH_ON_DISABLED, 0, 6), (ENABLED, 0, 6), (FAULT, 0, 0), (FAULT, 1, 0x80)],
+)
+def test_a_damaged_block_never_enables_the_drive(statusword, fault_reset, controlword):
+    controller, senders = Controller(CONTRACT, DAMAGED_BLOCKS[0]), Senders()
+    controller.on_start(0)
+    sent = []
+    for now_ns in (0, PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS):
+        _, command = controller.on_timer(now_ns).sends[0]
+        sent.append(command.data >> 16 & 0xFFFF)
+        controller.on_frame(now_ns, senders.frame("drive_status", statusword, 0))
+        controller.on_frame(now_ns, senders.frame("command", 1, k.LAW_ADRC, fault_reset))
+    assert (sent[0], sent[-1]) == (0, controlword)

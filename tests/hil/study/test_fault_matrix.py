@@ -245,6 +245,21 @@ def test_the_picture_has_no_empty_axes(tmp_path):
     assert len(re.findall(r'id="axes_\d+"', (tmp_path / "courses.svg").read_text())) == 2 * len(drawn)
 
 
+@pytest.mark.parametrize(("load_n", "sinks_mm_s"), [(0, 3.4), (2000, 8.4)])
+def test_the_safe_state_does_not_hold_a_load(load_n, sinks_mm_s):
+    page = (Path(__file__).parents[3] / "docs/fault_matrix.md").read_text(encoding="utf-8")
+    assert f"{sinks_mm_s} mm/s" in page
+    with InprocessRig(RigOptions(record_directory=Path())) as rig:
+        bench = Bench(rig, position_m=0.2)
+        bench.load_force(load_n)
+        bench.run(1.0)
+        bench.inject("sensor_status", status=2)
+        bench.run(0.75)
+        sunk_mm = np.ptp(bench.position_mm.between(1.25, 1.75).values)
+    assert bench.motor_speed_rpm.last == pytest.approx(0, abs=0.1)
+    assert sunk_mm / 0.5 == pytest.approx(sinks_mm_s, abs=0.1)
+
+
 def test_the_table_fits_a_narrow_terminal(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     arguments = ["faults", "--fault", "drop", "--phase", "standby", "--jobs", "1", "--out", str(tmp_path)]

@@ -395,6 +395,19 @@ def test_the_example_in_the_documentation_runs(capsys):
     assert capsys.readouterr().out.rstrip().endswith("of 2 fail")
 
 
+def test_the_tuning_in_the_documentation_can_be_played(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[3] / "docs/studies.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (example,) = [block for block in blocks if "mine.cal" in block]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "docs/studies.md", "exec"), {})
+    mine = ["--calibration", "mine.cal", "--duration", "0.1"]
+    assert cli.main(["run", "sine", "--mode", "inprocess", *mine]) == 0
+    assert cli.main(["sweep", "sine", "--samples", "2", *mine]) == 0
+    played = json.loads(Path("out/sine/result.json").read_text(encoding="utf-8"))
+    assert (played["tuning"], played["controller"]) == ("mine.cal", "scheduled")
+
+
 def test_the_documentation_shows_the_keys_and_ranges_of_the_built_in_box():
     page = (Path(__file__).parents[3] / "docs/studies.md").read_text(encoding="utf-8")
     shown = {
