@@ -105,7 +105,7 @@ def test_what_cannot_run_is_refused_in_one_line(given, message):
 
 def test_without_the_emulator_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(FirmwareError, match=r"pip install 'ddh-hil\[pil\]'"):
+    with pytest.raises(FirmwareError, match=r"pip install '\.\[pil\]' in the project's folder"):
         ChosenFirmware("cortex-m4").controller(CONTRACT, b"")
 
 
