@@ -109,10 +109,8 @@ class RealtimeRig(Rig):
         """
         longest_s = max(_SILENT_PERIODS * PERIOD_NS / 1e9 / float(self.options.rt_ratio), _SILENT_S)
         heard_ns = self.listener.newest_ns
-        last_ns = {side: heard_ns[can_id] for side, can_id in self._beacons.items()}
-        # a sensor may be silent while its plant runs
-        last_ns["plant"] = max(last_ns["plant"], heard_ns[self.contract.drive_status.can_id])
-        for side, newest_ns in last_ns.items():
+        for side, can_ids in self._signs_of_life.items():
+            newest_ns = max(heard_ns.get(can_id, 0) for can_id in can_ids)
             silent_s = (time.monotonic_ns() - newest_ns) / 1e9
             if silent_s > longest_s:
                 raise BenchError(f"the {side} has been silent for {silent_s:.1f} s: does it still run?")
@@ -143,7 +141,8 @@ class RealtimeRig(Rig):
     def _wait_for_both_sides(self, timeout_s: float) -> None:
         """Wait until both sides are heard from now on, and make sure that they keep our time."""
         self.listener.forget()
-        options, beacons = self.options, self._beacons
+        options = self.options
+        beacons = {side: can_ids[0] for side, can_ids in self._signs_of_life.items()}
         silent, times = list(beacons), {}
         deadline_s = time.monotonic() + timeout_s
         while silent:
@@ -159,11 +158,12 @@ class RealtimeRig(Rig):
             self._check_ratio(side, times[side])
 
     @property
-    def _beacons(self) -> dict[str, int]:
-        """What each side sends once a period."""
+    def _signs_of_life(self) -> dict[str, tuple[int, ...]]:
+        """What each side sends, first what it sends once a period: a silent sensor is no silent plant."""
+        contract = self.contract
         return {
-            "plant": self.contract.position_feedback.can_id,
-            "controller": self.contract.drive_command.can_id,
+            "plant": (contract.position_feedback.can_id, contract.drive_status.can_id),
+            "controller": (contract.drive_command.can_id,),
         }
 
     def _what_is_missing(self, side: str, timeout_s: float) -> str:

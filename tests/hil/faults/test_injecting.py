@@ -186,14 +186,21 @@ def test_in_real_time_sensor_and_load_do_what_they_are_told(tmp_path):
 
 def test_a_plant_whose_sensor_is_silent_still_runs(tmp_path):
     rig = RealtimeRig(RigOptions(record_directory=tmp_path))
+    feedback, status, command = (
+        message.can_id
+        for message in (CONTRACT.position_feedback, CONTRACT.drive_status, CONTRACT.drive_command)
+    )
     now_ns = time.monotonic_ns()
-    heard_ns = {CONTRACT.position_feedback.can_id: now_ns - 10**11, CONTRACT.drive_status.can_id: now_ns}
-    rig.listener = SimpleNamespace(newest_ns=heard_ns | {CONTRACT.drive_command.can_id: now_ns})
-    rig.check_sides()
-    heard_ns = dict.fromkeys(rig.listener.newest_ns, now_ns - 10**11)
-    rig.listener = SimpleNamespace(newest_ns=heard_ns | {CONTRACT.drive_command.can_id: now_ns})
-    with pytest.raises(BenchError, match="the plant has been silent for 100"):
+    long_ago_ns = now_ns - 10**11
+
+    def check_after(heard_ns: dict[int, int]) -> None:
+        rig.listener = SimpleNamespace(newest_ns=heard_ns)
         rig.check_sides()
+
+    check_after({feedback: long_ago_ns, status: now_ns, command: now_ns})
+    check_after({feedback: now_ns, command: now_ns})  # the slower message is not heard yet
+    with pytest.raises(BenchError, match="the plant has been silent for 100"):
+        check_after({feedback: long_ago_ns, status: long_ago_ns, command: now_ns})
 
 
 def sent_on(bench: Bench, message: str) -> list[int]:
